@@ -1,0 +1,865 @@
+"""LocoMTRL: a Laikago learns to walk over many terrains with its own LiDAR eyes.
+
+The environment (`LocoEnv`, PyBullet) and what one does with it: train, eval, play, gallery.
+A small, complete implementation of "Learning Visual-Locomotion Policies that Generalize to
+Diverse Environments"; the sections named below are the paper's.
+"""
+
+import argparse
+import contextlib
+import functools
+import json
+import logging
+import math
+import multiprocessing
+import os
+import subprocess
+import sys
+import tempfile
+import time
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import torch
+from tqdm import tqdm
+
+from ppo import PPOConfig, learn, load_checkpoint, load_policy
+from terrain import (
+    PERSON_HEIGHT,
+    PERSON_RADIUS,
+    PILLAR_TASKS,
+    WORLDS,
+    Terrain,
+    load_mesh,
+    make_terrain,
+    make_world,
+)
+from tg import LEGS, STANDING, TrajectoryGenerator
+
+
+@contextlib.contextmanager
+def _quiet():
+    """PyBullet prints banners from C; they have no place in progress bars and JSON."""
+    sys.stdout.flush()
+    saved, sink = [os.dup(1), os.dup(2)], os.open(os.devnull, os.O_WRONLY)
+    os.dup2(sink, 1), os.dup2(sink, 2)
+    try:
+        yield
+    finally:
+        os.dup2(saved[0], 1), os.dup2(saved[1], 2)
+        for file in (*saved, sink):
+            os.close(file)
+
+
+with _quiet():
+    import pybullet
+    import pybullet_data
+    from pybullet_utils.bullet_client import BulletClient
+
+# ------------------------------------------------------------------------------- the robot
+
+LAIKAGO = Path(pybullet_data.getDataPath()) / "laikago" / "laikago_toes_zup.urdf"
+JOINTS = ("hip_motor_2_chassis_joint", "upper_leg_2_hip_motor_joint", "lower_leg_2_upper_leg_joint")
+
+
+def robot_urdf(visual):
+    """The Laikago's URDF as text, made cheap to simulate.
+
+    Collision shapes become primitives: Bullet would spend most of a step between the original
+    convex hulls and the terrain's triangles. Pictures are kept only if `visual`; they cost 0.3 s
+    and 170 MB a robot.
+    """
+    tree = ET.parse(LAIKAGO)
+    for mesh in tree.iter("mesh"):
+        mesh.set("filename", str(LAIKAGO.parent / mesh.get("filename")))
+    for link in tree.iter("link"):
+        name, collision = link.get("name"), link.find("collision")
+        for part in link.findall("visual"):
+            if not visual:
+                link.remove(part)
+        for contact in link.findall("contact"):
+            contact.clear()  # drops spinning friction and the toes' friction anchors
+            ET.SubElement(contact, "lateral_friction", value="1")
+        if name == "chassis":
+            _replace(collision, (-0.0125, 0, -0.016), (0, 0, 1), "box", size="0.577 0.28 0.188")
+        elif name.endswith("hip_motor"):
+            link.remove(collision)  # inside the chassis box, but for a centimetre
+        elif name.endswith("upper_leg"):
+            _capsule(collision, (0, -0.20833, -0.1422), 0.03)
+        elif name.endswith("lower_leg"):
+            _capsule(collision, (0, -0.225, -0.0198), 0.015)  # ends inside the toe's sphere
+    return ET.tostring(tree.getroot(), encoding="unicode")
+
+
+def _replace(collision, centre, axis, shape, **size):
+    """A primitive at `centre` whose own z axis points along `axis`."""
+    pitch = math.atan2(math.hypot(axis[0], axis[1]), axis[2])
+    rpy = f"0 {pitch} {math.atan2(axis[1], axis[0])}"
+    collision.clear()
+    ET.SubElement(collision, "origin", xyz="{} {} {}".format(*centre), rpy=rpy)
+    ET.SubElement(ET.SubElement(collision, "geometry"), shape, **size)
+
+
+def _capsule(collision, end, radius):
+    """A capsule from the link's joint to `end`."""
+    size = {"radius": str(radius), "length": str(math.hypot(*end))}
+    _replace(collision, [c / 2 for c in end], end, "capsule", **size)
+
+
+# ------------------------------------------------------------------------------- the senses
+
+LIDAR_RANGE = 3.0  # m
+LIDAR_POSITION = (0.36, 0.0, 0.08)  # m, ahead of the chassis: rays that start inside cost 70x
+# Degrees. Steep rays see the ground that the front feet are about to meet, level ones see walls.
+LIDAR_ELEVATIONS = (-84, -70, -57, -45, -34, -25, -17, -10, -3, 8)
+LIDAR_AZIMUTHS = np.linspace(85, -85, 16)  # left to right
+N_RAYS = len(LIDAR_ELEVATIONS) * len(LIDAR_AZIMUTHS)
+
+
+def lidar_directions():
+    """Unit vectors (N_RAYS, 3) in the base frame, row by row from the lowest, left to right."""
+    grid = np.meshgrid(LIDAR_ELEVATIONS, LIDAR_AZIMUTHS, indexing="ij")
+    up, left = np.radians(grid).reshape(2, -1)
+    return np.stack([np.cos(up) * np.cos(left), np.cos(up) * np.sin(left), np.sin(up)], axis=1)
+
+
+# ------------------------------------------------------------------------------- the environment
+
+SUBSTEPS, DT = 5, 1 / 30  # physics steps in a control step, and its length in s
+MAX_TORQUE = 40.0  # Nm
+# Bullet's implicit PD, per physics step. Compliant on purpose: of 1,500 random gaits on rugged
+# ground those with a position gain of 0.25 stayed up a third as long.
+POSITION_GAIN, VELOCITY_GAIN = 0.08, 1.0
+SMOOTHING = 0.5  # share of a new action that takes effect at once; the rest would be jitter
+RESIDUAL = {True: 0.25, False: 0.6}  # rad, largest u_fb with the TG, and without
+GOAL_RADIUS = 0.5  # m, r_g
+BASE_HEIGHT = 0.38  # m, of the walking base: a goal floats that high over the ground
+FALL_UP, FALL_SPEED = 0.5, 2.5  # fallen: tipped by over 60 degrees, or dropping faster (m/s)
+MAX_EPISODE_STEPS = 600  # 20 s
+PICTURE = (480, 360)  # pixels
+HOT = ("setJointMotorControlArray", "stepSimulation", "getBasePositionAndOrientation",
+       "getBaseVelocity", "getMatrixFromQuaternion", "getJointStates", "rayTestBatch")  # fmt: skip
+STATIC_GROUP = 2  # Bullet's collision group of all that does not move by itself: rays see only it
+
+
+def _about_z(yaw):
+    """Quaternion of a turn by `yaw` (rad) about the z axis."""
+    return 0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2)
+
+
+class LocoEnv(gymnasium.Env):
+    """A Laikago walks to a goal over terrain that only its LiDAR shows it (section 2).
+
+    ## Observation: Box((202,), float32), in the order of section 2.1
+    | entries | meaning | unit |
+    |---|---|---|
+    | 160 | r, LiDAR scan: distance / 3 m, 1 = nothing hit; rows from low to high, left to right | |
+    | 1 | g_d, distance to the goal | m |
+    | 1 | g_h, heading of the goal relative to the robot's, left positive | rad |
+    | 3 | angular rates of the base in its own frame (IMU) | rad/s |
+    | 12 | q, joint angles: FR, FL, RR, RL x abduction, hip, knee | rad |
+    | 12 | a_{t-1}, joint targets commanded in the previous step | rad |
+    | 13 | s_tg, state of the trajectory generator; none with tg=False | |
+    As in the paper it holds neither roll and pitch nor the task. lidar=False leaves out the scan.
+
+    ## Action: Box(-1, 1, (17,), float32), clipped to that range, then smoothed
+    5 parameters of the trajectory generator (`tg.PARAMETERS`), then the 12 residuals u_fb;
+    u_tg + u_fb are joint targets, which PD controllers with limited torque track (section 2.2).
+    With tg=False (reactive), 12 offsets from the standing pose.
+
+    ## Reward
+    (d_{t-1} - d_t) / dt, the velocity toward the goal, m/s. The paper prints the opposite sign but
+    calls it the velocity toward the target.
+
+    ## Episode
+    It terminates at the goal (base within 0.5 m) and in a fall (base tipped by over 60 degrees or
+    dropping faster than 2.5 m/s: both break a real robot). The time limit is the wrapper's.
+
+    `info` holds task, t_cr = 1 - d_T / d_0 in [0, 1] (1 at the goal), success, fall, and
+    collisions: how often the robot has bumped into a person.
+
+    Args:
+        tasks: a task's name, a function (rng, difficulty) -> heights, a finished Terrain, or a list
+            of these; None: all pillar tasks. Each episode draws one; the policy is not told which.
+        difficulty: in [0, 1], or (low, high) to draw it from, once for each terrain.
+        tg, lidar: the paper's ablations (section 3) leave one of them out.
+        terrains: how many terrains of each task to build; Bullet never frees a mesh, so the pool
+            is built once and episodes draw from it. A finished Terrain counts once.
+        pool_seed: seeds the pool; `reset(seed=...)` seeds all else.
+        render_mode: None or "rgb_array".
+        gui: open PyBullet's window; it allows one in a process.
+
+    Raises:
+        ValueError: for any argument out of range, naming it and what is valid.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": round(1 / DT)}
+
+    def __init__(self, tasks=None, difficulty=(0.0, 1.0), tg=True, lidar=True, terrains=1,
+                 pool_seed=0, render_mode=None, gui=False):  # fmt: skip
+        if render_mode not in (None, "rgb_array"):
+            raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
+        low, high = np.broadcast_to(difficulty, 2)
+        if not 0 <= low <= high <= 1:
+            raise ValueError(f"difficulty must be in [0, 1] or (low, high), got {difficulty}")
+        if terrains < 1:
+            raise ValueError(f"terrains must be at least 1, got {terrains}")
+        self.render_mode, self.show_lidar = render_mode, False
+        tasks = list(PILLAR_TASKS) if tasks is None else tasks
+        tasks = tasks if isinstance(tasks, (list, tuple)) else [tasks]
+        if not tasks:
+            raise ValueError(f"tasks must hold at least one task; valid: {', '.join(PILLAR_TASKS)}")
+        rng = np.random.default_rng(pool_seed)
+        self.pool = [
+            make_terrain(task, rng, rng.uniform(low, high))
+            for task in tasks
+            for _ in range(1 if isinstance(task, Terrain) else terrains)
+        ]
+        self.generator = TrajectoryGenerator() if tg else None
+        self._connect(gui)
+        self.n_rays = N_RAYS if lidar else 0
+        # Generous bounds: what lies beyond them is no longer a robot, and the episode ends.
+        high = [1e3, np.pi] + [1e3] * 3 + [1e2] * 24 + [1.0] * TrajectoryGenerator.state_size * tg
+        low = np.concatenate([np.zeros(self.n_rays + 1), np.negative(high[1:])])
+        high = np.concatenate([np.ones(self.n_rays), high])
+        self.observation_space = gymnasium.spaces.Box(*np.float32([low, high]))
+        n_act = 12 + TrajectoryGenerator.action_size * tg
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (n_act,))
+        self.terrain = None
+
+    def _connect(self, gui):
+        self.visual = visual = gui or self.render_mode is not None
+        with _quiet():
+            mode = pybullet.GUI if gui else pybullet.DIRECT
+            self.bullet = p = BulletClient(connection_mode=mode)
+        for name in HOT:  # BulletClient looks a function up anew for each call, which costs 3 us
+            setattr(p, name, getattr(p, name))
+        p.setGravity(0, 0, -9.81)
+        p.setPhysicsEngineParameter(
+            fixedTimeStep=DT, numSubSteps=SUBSTEPS, numSolverIterations=20, enableConeFriction=0
+        )
+        # Side by side, farther apart than the LiDAR reaches: a reset only moves the robot.
+        self.offsets, edge = [], 0.0
+        for terrain in self.pool:
+            low, high = terrain.vertices[:, 0].min(), terrain.vertices[:, 0].max()
+            self.offsets.append(edge - low)
+            edge += high - low + 2 * LIDAR_RANGE
+            self._add_mesh(terrain, self.offsets[-1], visual)
+        self._load_robot()
+        self.people = []
+        n_people = max(len(terrain.people) for terrain in self.pool)
+        for _ in range(n_people):
+            size = dict(radius=PERSON_RADIUS, height=PERSON_HEIGHT)
+            shape = p.createCollisionShape(p.GEOM_CYLINDER, **size)
+            looks = -1
+            if visual:
+                size["length"] = size.pop("height")
+                looks = p.createVisualShape(p.GEOM_CYLINDER, rgbaColor=(0.9, 0.5, 0.2, 1), **size)
+            self.people.append(p.createMultiBody(0, shape, looks))
+        ends = np.array(LIDAR_POSITION) + LIDAR_RANGE * lidar_directions()
+        if visual:
+            sphere = p.createVisualShape(p.GEOM_SPHERE, radius=0.2, rgbaColor=(0.2, 0.8, 0.3, 1))
+            self.flag = p.createMultiBody(0, -1, sphere)
+        self._rays = [LIDAR_POSITION] * N_RAYS, ends.tolist()
+        self._gains = dict(
+            positionGains=[POSITION_GAIN] * 12,
+            velocityGains=[VELOCITY_GAIN] * 12,
+            forces=[MAX_TORQUE] * 12,
+        )
+
+    def _load_robot(self):
+        p = self.bullet
+        with tempfile.TemporaryDirectory() as folder:
+            urdf = Path(folder) / "laikago.urdf"
+            urdf.write_text(robot_urdf(self.visual))
+            self.robot = p.loadURDF(str(urdf), [0, 0, 1000])
+        joints = [p.getJointInfo(self.robot, j) for j in range(p.getNumJoints(self.robot))]
+        ids = {joint[1].decode(): joint[0] for joint in joints}
+        self.joints = [ids[f"{leg}_{joint}"] for leg in LEGS for joint in JOINTS]
+
+    def _add_mesh(self, terrain, offset, visual):
+        p = self.bullet
+        mesh = dict(vertices=terrain.vertices.tolist(), indices=terrain.triangles.ravel().tolist())
+        shape = p.createCollisionShape(p.GEOM_MESH, flags=p.GEOM_FORCE_CONCAVE_TRIMESH, **mesh)
+        looks = -1
+        if visual:
+            looks = p.createVisualShape(p.GEOM_MESH, rgbaColor=(0.7, 0.72, 0.68, 1), **mesh)
+        body = p.createMultiBody(0, shape, looks, basePosition=(offset, 0, 0))
+        p.changeDynamics(body, -1, lateralFriction=1.0)
+
+    # ---------------------------------------------------------------- one episode
+
+    def reset(self, *, seed=None, options=None):
+        """Stands the robot at a start; `options={"terrain": i, "route": k}` chooses which."""
+        super().reset(seed=seed)
+        p, rng, options = self.bullet, self.np_random, options or {}
+        if seed is not None:  # Bullet's contact caches would remember the episodes before
+            p.removeBody(self.robot)
+            self._load_robot()
+        index = options.get("terrain", rng.integers(len(self.pool)))
+        self.terrain = terrain = self.pool[index]
+        route = options.get("route", rng.integers(len(terrain.starts)))
+        self.origin = np.array([self.offsets[index], 0.0, 0.0])
+        x, y, z, yaw = terrain.starts[route]
+        self.goal = terrain.goals[route] + self.origin + [0, 0, BASE_HEIGHT]
+        yaw += rng.uniform(-0.5, 0.5)
+
+        self.target = STANDING
+        if self.generator:
+            self.generator.reset(rng.uniform(0, 2 * np.pi))
+            self.target = self.generator.step(np.zeros(self.generator.action_size), 0.0)
+        self.action = np.zeros(self.action_space.shape)
+        position = self.origin + [x, y, z + BASE_HEIGHT + 0.02]
+        p.resetBasePositionAndOrientation(self.robot, position, _about_z(yaw))
+        p.resetBaseVelocity(self.robot, [0, 0, 0], [0, 0, 0])
+        for joint, angle in zip(self.joints, self.target, strict=True):
+            p.resetJointState(self.robot, joint, angle)
+        self.time, self.collisions, self.touching = 0.0, 0, False
+        self._move_people()
+        observation = self._observe()
+        self.start_distance = self.distance
+        if self.visual:
+            p.resetBasePositionAndOrientation(self.flag, self.goal, (0, 0, 0, 1))
+            dx, dy, _ = self.goal - self.position
+            self.view_yaw = math.degrees(math.atan2(dy, dx)) - 90
+        return observation, self._info(False, False)
+
+    def step(self, action):
+        p = self.bullet
+        action = np.asarray(action, dtype=np.float64)
+        if action.shape != self.action.shape or not np.isfinite(action).all():
+            raise ValueError(f"action must be {self.action.size} finite numbers, got {action}")
+        self.action += SMOOTHING * (np.clip(action, -1.0, 1.0) - self.action)
+        if self.generator:
+            n = self.generator.action_size
+            u_fb = RESIDUAL[True] * self.action[n:]
+            self.target = self.generator.step(self.action[:n], DT) + u_fb
+        else:
+            self.target = STANDING + RESIDUAL[False] * self.action
+        p.setJointMotorControlArray(
+            self.robot, self.joints, p.POSITION_CONTROL, self.target.tolist(), **self._gains
+        )
+        p.stepSimulation()
+        self.time += DT
+        if self.people:
+            before, self.touching = self.touching, any(
+                p.getContactPoints(self.robot, body) for body in self.people
+            )
+            self.collisions += self.touching and not before
+            self._move_people()
+
+        before = self.distance
+        observation = self._observe()
+        success = self.distance < GOAL_RADIUS
+        fall = self.up < FALL_UP or self.velocity[2] < -FALL_SPEED
+        reward = (before - self.distance) / DT
+        return observation, reward, success or fall, False, self._info(success, fall)
+
+    def _info(self, success, fall):
+        progress = 1.0 if success else 1.0 - self.distance / self.start_distance
+        return {
+            "task": self.terrain.name,
+            "t_cr": max(0.0, progress),
+            "success": success,
+            "fall": fall and not success,
+            "collisions": self.collisions,
+        }
+
+    def _move_people(self):
+        for body, person in zip(self.people, self.terrain.people, strict=False):
+            x, y, yaw = person.position(self.time)
+            z = self.terrain.height(x, y) + PERSON_HEIGHT / 2
+            self.bullet.resetBasePositionAndOrientation(
+                body, (x + self.origin[0], y, z), _about_z(yaw)
+            )
+
+    def _observe(self):
+        p = self.bullet
+        position, quaternion = p.getBasePositionAndOrientation(self.robot)
+        self.velocity, rates = p.getBaseVelocity(self.robot)
+        r = p.getMatrixFromQuaternion(quaternion)
+        self.position, self.up = position, r[8]
+        dx, dy, dz = (g - b for g, b in zip(self.goal, position, strict=True))
+        self.distance = math.sqrt(dx * dx + dy * dy + dz * dz)
+        heading = math.atan2(dy, dx) - math.atan2(r[3], r[0])
+        state = [self.distance, (heading + math.pi) % (2 * math.pi) - math.pi]
+        state += [r[i] * rates[0] + r[3 + i] * rates[1] + r[6 + i] * rates[2] for i in range(3)]
+        state += [joint[0] for joint in p.getJointStates(self.robot, self.joints)]
+        scan = []
+        if self.n_rays:
+            self.hits = p.rayTestBatch(
+                *self._rays,
+                parentObjectUniqueId=self.robot,
+                parentLinkIndex=-1,
+                collisionFilterMask=STATIC_GROUP,
+            )
+            scan = [hit[2] for hit in self.hits]
+        s_tg = self.generator.state() if self.generator else ()
+        return np.concatenate([scan, state, self.target, s_tg], dtype=np.float32)
+
+    def render(self):
+        """The robot from above and behind, as uint8 (360, 480, 3)."""
+        p, (width, height) = self.bullet, PICTURE
+        view = p.computeViewMatrixFromYawPitchRoll(self.position, 2.4, self.view_yaw, -42, 0, 2)
+        projection = p.computeProjectionMatrixFOV(55, width / height, 0.1, 40)
+        rgba = p.getCameraImage(
+            width, height, view, projection, renderer=p.ER_TINY_RENDERER,
+            lightDirection=(2, 3, 8),
+        )[2]  # fmt: skip
+        picture = np.reshape(rgba, (height, width, 4))[..., :3].astype(np.uint8)
+        if self.show_lidar:
+            points = np.array([(*hit[3], 1.0) for hit in self.hits if hit[2] < 1])
+            matrices = [np.reshape(m, (4, 4)) for m in (view, projection)]  # both transposed
+            x, y, _, w = (points @ matrices[0] @ matrices[1]).T
+            columns, rows = (1 + x / w) / 2 * width, (1 - y / w) / 2 * height
+            for dx, dy in ((0, 0), (1, 0), (0, 1), (1, 1)):
+                i, j = (rows + dy).astype(int), (columns + dx).astype(int)
+                seen = (w > 0) & (i >= 0) & (i < height) & (j >= 0) & (j < width)
+                picture[i[seen], j[seen]] = (220, 30, 30)
+        return picture
+
+    def mirror(self):
+        """The left-right symmetry: mirrored, o becomes o[i] * s and an action a becomes a[j] * t.
+
+        Returns:
+            (i, s, j, t): indices and signs over the observation, then over the action.
+        """
+        legs = np.arange(12).reshape(4, 3)[[1, 0, 3, 2]].ravel()  # joint angles mirror unsigned
+        swap = np.array([1, 0, 3, 2])
+        parameters = np.array([0, 2, 1, 3, 4])  # left and right stride change places
+        scan = np.arange(self.n_rays).reshape(-1, len(LIDAR_AZIMUTHS))[:, ::-1].ravel()
+        parts, signs = [scan, np.arange(5), legs, legs], np.ones(self.observation_space.shape)
+        signs[scan.size + np.array([1, 2, 4])] = -1  # heading, roll rate, yaw rate
+        actions = [legs]
+        if self.generator:
+            parts += [swap, swap, parameters]
+            actions = [parameters, legs]
+        chain = [
+            np.concatenate([p + sum(map(len, group[:k])) for k, p in enumerate(group)])
+            for group in (parts, actions)
+        ]
+        return chain[0], signs, chain[1], np.ones(self.action_space.shape)
+
+    def close(self):
+        if self.bullet is not None:
+            self.bullet.disconnect()
+            self.bullet = None
+
+
+gymnasium.register("LocoMTRL-v0", "loco_mtrl:LocoEnv", max_episode_steps=MAX_EPISODE_STEPS)
+
+
+# ------------------------------------------------------------------------------- train
+
+REWARD_SCALE = 0.1  # keeps the critic's targets near 1; the environment's own reward is the paper's
+MAIN_STEPS = 3_000_000  # of the no-argument run
+
+
+def training_env(index, seed, **options):
+    """Environment number `index` over all ranks, with a pool of terrains of its own."""
+    env = gymnasium.make(
+        "LocoMTRL-v0", disable_env_checker=True, pool_seed=(seed, index), **options
+    )
+    return gymnasium.wrappers.TransformReward(env, lambda reward: REWARD_SCALE * reward)
+
+
+def train(args):
+    """`train`: one rank per core unless torchrun has started us already."""
+    run_dir = Path(args.run_dir)
+    if "WORLD_SIZE" not in os.environ and args.ranks > 1:
+        if args.resume:
+            load_checkpoint(run_dir / "checkpoint.pt")  # a bad one is better named by one process
+        return launch(args)
+    options = {"tg": args.tg, "lidar": args.lidar}
+    meta = {
+        **options,
+        "tasks": args.tasks,
+        "sequential": args.sequential,
+        "seed": args.seed,
+        "command": "python loco_mtrl.py " + " ".join(args.argv),
+        "commit": _commit(),
+    }
+    # Sequential training (section 3) is training on one task after the other: resumed, each time.
+    stages = [[task] for task in args.tasks] if args.sequential else [args.tasks]
+    with contextlib.closing(LocoEnv("flat", **options)) as env:
+        mirror = env.mirror()
+    resume = args.resume
+    try:
+        for k, tasks in enumerate(stages):
+            config = PPOConfig(
+                total_timesteps=args.steps * (k + 1) // len(stages),
+                gamma=0.995,  # a detour pays after seconds: 200 steps are 6.7 s
+                exteroceptive=N_RAYS * args.lidar,
+                seed=args.seed,
+            )
+            make_env = functools.partial(training_env, seed=args.seed, tasks=tasks, **options)
+            learn(make_env, config, run_dir=run_dir, resume=resume, mirror=mirror, meta=meta,
+                  groups=args.tasks)  # fmt: skip
+            resume = True
+    except KeyboardInterrupt:
+        if int(os.environ.get("RANK", 0)) == 0:
+            again = [a for a in args.argv if a != "--resume"] + ["--resume"]
+            print(f"\nStopped and saved. To go on: python loco_mtrl.py {' '.join(again)}")
+        return 130
+    if int(os.environ.get("RANK", 0)) == 0:
+        checkpoint = load_checkpoint(run_dir / "checkpoint.pt")
+        checkpoint["optimiser"] = None
+        torch.save(checkpoint, run_dir / "policy.pt")
+        print(f"Policy: {run_dir / 'policy.pt'}   Curve: {run_dir / 'curve.png'}")
+    return 0
+
+
+def launch(args):
+    """Starts one rank per core through torch's own launcher, and waits for them."""
+    import torch.distributed.run as torchrun
+    from torch.distributed.elastic.multiprocessing import SignalException
+    from torch.distributed.elastic.multiprocessing.errors import ChildFailedError
+
+    logging.getLogger("torch.distributed.elastic").setLevel(logging.CRITICAL)
+    try:
+        torchrun.main(
+            ["--standalone", f"--nproc-per-node={args.ranks}", "-m", "loco_mtrl", *args.argv]
+        )
+    except SignalException as signal:
+        return 128 + signal.sigval
+    except ChildFailedError as error:
+        return error.get_first_failure()[1].exitcode  # the rank itself has said what is wrong
+    return 0
+
+
+def _commit():
+    """The commit of this code, for the record of a run; empty outside a git checkout."""
+    command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"]
+    try:
+        return subprocess.run(command, capture_output=True, text=True).stdout.strip()
+    except OSError:
+        return ""
+
+
+# ------------------------------------------------------------------------------- eval
+
+EVAL_SECONDS = 60  # an episode's limit: 36 m at 0.6 m/s, three times the farthest goal
+GIF_EVERY = 3  # control steps a frame: 10 frames a second
+EVAL_SEED = 10_000  # episode k of every policy in every world has seed EVAL_SEED + k
+# Tables 1 and 2, t_cr in the order of WORLDS: means, then standard deviations, in hundredths.
+PAPER = {
+    "flat": "39 22 54 51 50 43 32 57  17 21 12 16 12 13 18 12",
+    "rugged": "57 28 64 60 59 65 36 73  18 11 12 15 16 18 16 17",
+    "holes": "33 22 41 38 38 39 52 57  18 12 15 16 13 12 15 13",
+    "obstacles": "70 23 67 69 68 59 55 53  19 04 19 15 17 09 13 16",
+    "stairs": "39 28 52 49 43 60 38 68  18 11 14 13 16 19 18 10",
+    "reactive": "67 65 76 77 56 75 68 64  13 16 16 19 12 14 10 14",
+    "no vision": "56 44 54 51 47 57 32 54  17 12 16 15 17 16 08 13",
+    "sequential": "60 29 63 62 59 61 57 61  18 15 17 14 19 13 14 17",
+    "ours": "72 67 84 83 79 78 70 72  13 12 11 13 14 10 17 19",
+}
+
+
+def zero_action(observation, env):
+    """The trajectory generator alone."""
+    return np.zeros(env.action_space.shape)
+
+
+def walk_straight(observation, env):
+    """Walks straight at the goal on the same trajectory generator: steers, but sees nothing."""
+    action = np.zeros(env.action_space.shape)
+    heading = observation[env.unwrapped.n_rays + 1]
+    action[1:3] = 0.4 + np.clip(heading, -0.6, 0.6) * np.array([-1, 1])  # left, right stride
+    return action
+
+
+REFERENCES = {"zero": zero_action, "straight": walk_straight}
+
+
+def load_actor(name):
+    """(act, options, row): `act(observation, env)`, LocoEnv's options, a row of PAPER or None.
+
+    `name` is a checkpoint's path or one of REFERENCES. Raises as `load_checkpoint` does.
+    """
+    if name in REFERENCES:
+        return REFERENCES[name], {}, None
+    model, checkpoint = load_policy(name)
+    meta = checkpoint["meta"]
+    if not {"tg", "lidar", "tasks", "sequential"} <= set(meta):
+        raise ValueError(f"{name} is not a policy for LocoEnv: {meta}")
+    options, tasks, row = {"tg": meta["tg"], "lidar": meta["lidar"]}, meta["tasks"], "ours"
+    with contextlib.closing(LocoEnv("flat", **options)) as env:
+        size, given = env.observation_space.shape[0], model.kwargs["obs_dim"]
+    if size != given:
+        raise ValueError(f"{name} takes observations of {given} numbers, LocoEnv gives {size}")
+    if not meta["tg"]:
+        row = "reactive"
+    elif not meta["lidar"]:
+        row = "no vision"
+    elif meta["sequential"]:
+        row = "sequential"
+    elif len(tasks) == 1:
+        row = tasks[0] if tasks[0] in PAPER else None
+    return lambda observation, env: model.mean_action(observation), options, row
+
+
+def make_place(name, seed):
+    """The terrain that episode `seed` of `name` is walked in: a world, a task, or a mesh file."""
+    if name in WORLDS:
+        return make_world(name, seed)
+    if name in PILLAR_TASKS:
+        rng = np.random.default_rng(seed)
+        return make_terrain(name, rng, rng.uniform())
+    return load_mesh(name)
+
+
+def episodes(job):
+    """One episode of each actor: job = (place, seed, actors) -> job, [{t_cr, success, ...}, ...]"""
+    place, seed, actors = job
+    torch.set_num_threads(1)
+    terrain, results = make_place(place, seed), []
+    for actor in actors:
+        act, options, _ = load_actor(actor)
+        env = gymnasium.make("LocoMTRL-v0", tasks=terrain, disable_env_checker=True,
+                             max_episode_steps=round(EVAL_SECONDS / DT), **options)  # fmt: skip
+        observation, info = env.reset(seed=seed)
+        ended = False
+        while not ended:
+            observation, _, terminated, truncated, info = env.step(act(observation, env))
+            ended = terminated or truncated
+        seconds = env.unwrapped.time
+        keys = ("t_cr", "success", "fall", "collisions")
+        results.append({k: float(info[k]) for k in keys} | {"seconds": seconds})
+        env.close()
+    return job, results
+
+
+def evaluate(actors, places, n_episodes, workers):
+    """Scores of every actor in every place: {place: array (actors, episodes) of dicts}.
+
+    Every episode runs in an environment of its own, so the scores do not depend on `workers`.
+    """
+    jobs = [(place, EVAL_SEED + k, actors) for place in places for k in range(n_episodes)]
+    scores = {place: [[None] * n_episodes for _ in actors] for place in places}
+    # Workers are replaced now and then: Bullet never gives a mesh's memory back.
+    with multiprocessing.get_context("spawn").Pool(workers, maxtasksperchild=20) as pool:
+        done = pool.imap_unordered(episodes, jobs)
+        for (place, seed, _), results in tqdm(done, total=len(jobs), unit="episode"):
+            for k, result in enumerate(results):
+                scores[place][k][seed - EVAL_SEED] = result
+    return scores
+
+
+def eval_command(args):
+    """`eval`: the table of the paper for one or more policies."""
+    rows = [load_actor(actor)[2] for actor in args.policies]  # bad files are named before any work
+    scores = evaluate(args.policies, args.worlds, args.episodes, args.ranks)
+    report = {"policies": args.policies, "episodes": args.episodes, "worlds": {}}
+    for place, runs in scores.items():
+        flat = [run for policy in runs for run in policy]
+        mean = {k: float(np.mean([run[k] for run in flat])) for k in flat[0]}
+        mean["std"] = float(np.std([run["t_cr"] for run in flat]))
+        mean["per_policy"] = [float(np.mean([run["t_cr"] for run in policy])) for policy in runs]
+        report["worlds"][place] = mean
+    table = report["worlds"]
+    report["mean_t_cr"] = float(np.mean([world["t_cr"] for world in table.values()]))
+    lines = [
+        ("", list(table)),
+        ("t_cr", [f"{w['t_cr']:.2f}" for w in table.values()]),
+        ("+- std", [f"{w['std']:.2f}" for w in table.values()]),
+    ]
+    if len(set(rows)) == 1 and rows[0] and list(table) == list(WORLDS):
+        figures = ["0." + figure for figure in PAPER[rows[0]].split()]
+        lines += [(f"paper: {rows[0]}", figures[:8]), ("+- std", figures[8:])]
+    lines += [
+        (key, [f"{w[key]:.2f}" for w in table.values()])
+        for key in ("success", "fall", "collisions", "seconds")
+    ]
+    for name, cells in lines:
+        print(f"{name:18}" + "".join(f"{cell:>14}" for cell in cells))
+    for k, actor in enumerate(args.policies):
+        each = np.mean([w["per_policy"][k] for w in table.values()])
+        print(f"mean t_cr {each:.3f}  {actor}")
+    if args.json:
+        Path(args.json).write_text(json.dumps(report, indent=2) + "\n")
+    return 0
+
+
+# ------------------------------------------------------------------------------- play, gallery
+
+
+def draw_map(axis, terrain):
+    """Draws a terrain from above: shaded heights, starts (white), goals (green), people's ways."""
+    from matplotlib.colors import LightSource
+
+    low, high = terrain.vertices[:, :2].min(0), terrain.vertices[:, :2].max(0)
+    x, y = (np.arange(a + 0.025, b, 0.05) for a, b in zip(low, high, strict=True))
+    z = terrain.height(*np.meshgrid(x, y))
+    z = np.where(np.isfinite(z), z, np.nanmin(z[np.isfinite(z)]))
+    span = dict(vmin=min(z.min(), -0.5), vmax=max(z.max(), 0.5))
+    shaded = LightSource(315, 40).shade(z, axis.figure.colormap, blend_mode="soft", **span)
+    axis.imshow(shaded, origin="lower", extent=(low[0], high[0], low[1], high[1]))
+    for person in terrain.people:
+        axis.plot(*person.path.T, color="tab:orange", lw=0.8)
+    axis.plot(*terrain.starts[:, :2].T, "wo", ms=4, mec="k")
+    axis.plot(*terrain.goals[:, :2].T, "o", color="tab:green", ms=4, mec="k")
+    axis.set(xticks=[], yticks=[])
+
+
+def _figure(**options):
+    """A matplotlib figure that needs no display."""
+    from matplotlib import colormaps
+    from matplotlib.figure import Figure
+
+    figure = Figure(layout="constrained", **options)
+    figure.colormap = colormaps["cividis"]
+    return figure
+
+
+def play(args):
+    """`play`: one episode in PyBullet's window, or as a GIF and a picture of the path."""
+    act, options, _ = load_actor(args.policy)
+    if args.mesh:
+        terrain = load_mesh(args.mesh, args.scale, args.up)
+    else:
+        terrain = make_place(args.world, args.seed)
+    options |= {"gui": True} if args.gui else {"render_mode": "rgb_array"}
+    env = gymnasium.make("LocoMTRL-v0", tasks=terrain, disable_env_checker=True,
+                         max_episode_steps=round(EVAL_SECONDS / DT), **options)  # fmt: skip
+    env.unwrapped.show_lidar = args.lidar
+    observation, info = env.reset(seed=args.seed)
+    frames, path, ended = [], [], False
+    with tqdm(total=EVAL_SECONDS, unit="s", bar_format="{l_bar}{bar}|{n:.0f}/{total} s") as bar:
+        while not ended:
+            if args.gui:
+                time.sleep(DT)
+            elif len(path) % GIF_EVERY == 0:
+                frames.append(env.render())
+            path.append(np.array(env.unwrapped.position) - env.unwrapped.origin)
+            observation, _, terminated, truncated, info = env.step(act(observation, env))
+            ended = terminated or truncated
+            bar.update(DT)
+    end = "reached the goal" if info["success"] else "fell" if info["fall"] else "ran out of time"
+    print(f"{terrain.name}: t_cr {info['t_cr']:.2f}, {end} after {len(path) * DT:.1f} s")
+    if not args.gui:
+        from PIL import Image
+
+        pictures = [Image.fromarray(frame).quantize(48) for frame in frames]
+        pictures[0].save(args.gif, save_all=True, append_images=pictures[1:], loop=0,
+                         duration=round(1000 * GIF_EVERY * DT))  # fmt: skip
+        figure = _figure(figsize=(6, 5))
+        axis = figure.subplots()
+        draw_map(axis, terrain)
+        axis.plot(*np.array(path)[:, :2].T, color="tab:red")
+        axis.set_title(f"{terrain.name}, seed {args.seed}: {end}, t_cr {info['t_cr']:.2f}")
+        picture = Path(args.gif).with_suffix(".png")
+        figure.savefig(picture, dpi=100)
+        print(f"{args.gif}  {picture}")
+    env.close()
+    return 0
+
+
+def gallery(args):
+    """`gallery`: every training task and every unseen world from above, in one picture."""
+    figure = _figure(figsize=(15, 11))
+    names = [*PILLAR_TASKS, *WORLDS]
+    axes = figure.subplots(-(-len(names) // 7), 7).ravel()
+    for axis in axes[len(names) :]:
+        axis.remove()
+    for axis, name in zip(axes, tqdm(names, unit="terrain"), strict=False):
+        rng = np.random.default_rng(args.seed)
+        unseen = name in WORLDS
+        draw_map(axis, make_world(name, args.seed) if unseen else make_terrain(name, rng, 0.8))
+        axis.set_title(name, color="tab:red" if unseen else "k", fontsize=11)
+    figure.savefig(args.out, dpi=75)
+    print(args.out)
+    return 0
+
+
+# ------------------------------------------------------------------------------- command line
+
+
+def _names(valid, what):
+    def parse(text):
+        names = text.split(",")
+        for name in names:
+            if name not in valid:
+                raise argparse.ArgumentTypeError(
+                    f"unknown {what} {name!r}; valid: {', '.join(valid)}"
+                )
+        return names
+
+    return parse
+
+
+def _count(text):
+    value = int(float(text)) if text.replace(".", "").replace("e", "").isdigit() else 0
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"must be a whole number of at least 1, got {text!r}")
+    return value
+
+
+def parse(argv):
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    parser = argparse.ArgumentParser("loco_mtrl.py", description=__doc__.split("\n")[0])
+    commands = parser.add_subparsers(dest="command")
+    places = _names([*WORLDS, *PILLAR_TASKS], "world")
+
+    p = commands.add_parser("train", help="train a policy")
+    p.add_argument("--steps", type=_count, default=MAIN_STEPS, help="of the environment, in all")
+    p.add_argument("--tasks", type=_names(PILLAR_TASKS, "task"), default=list(PILLAR_TASKS),
+                   help="comma-separated; default: all %(default)s")  # fmt: skip
+    p.add_argument("--no-tg", dest="tg", action="store_false", help="reactive policy")
+    p.add_argument("--no-lidar", dest="lidar", action="store_false", help="blind policy")
+    p.add_argument("--sequential", action="store_true", help="one task after the other, not mixed")
+    p.add_argument("--seed", type=int, default=0)
+    p.add_argument("--run-dir", default="runs/main", help="(default %(default)s)")
+    p.add_argument("--resume", action="store_true", help="go on from the run's checkpoint")
+    p.add_argument("--ranks", type=_count, default=cores, help="processes; default: every core")
+    p.set_defaults(run=train)
+
+    p = commands.add_parser("eval", help="score policies in worlds they never saw")
+    p.add_argument("policies", nargs="+", metavar="POLICY",
+                   help=f"a .pt file, or a reference: {', '.join(REFERENCES)}")  # fmt: skip
+    p.add_argument("--worlds", type=places, default=list(WORLDS),
+                   help="comma-separated worlds, or training tasks on held-out seeds")  # fmt: skip
+    p.add_argument("--episodes", type=_count, default=20, help="per world (default %(default)s)")
+    p.add_argument("--json", metavar="FILE", help="write the scores there, too")
+    p.add_argument("--ranks", type=_count, default=cores, help="processes; default: every core")
+    p.set_defaults(run=eval_command)
+
+    p = commands.add_parser("play", help="watch a policy for one episode")
+    p.add_argument("policy", metavar="POLICY", help="as in eval")
+    p.add_argument("--world", type=lambda text: places(text)[0], default="maze",
+                   help="a world or a training task (default %(default)s)")  # fmt: skip
+    p.add_argument("--mesh", metavar="FILE.obj", help="walk through a scanned building instead")
+    p.add_argument("--scale", type=float, default=1.0, help="of the mesh, metres a unit")
+    p.add_argument("--up", choices=("z", "y"), default="z", help="axis of the mesh that points up")
+    p.add_argument("--seed", type=int, default=EVAL_SEED, help="layout (default %(default)s)")
+    p.add_argument("--gif", metavar="FILE", default="play.gif", help="(default %(default)s)")
+    p.add_argument("--lidar", action="store_true", help="draw where the LiDAR's rays hit")
+    p.add_argument("--gui", action="store_true", help="PyBullet's window instead of a GIF")
+    p.set_defaults(run=play)
+
+    p = commands.add_parser("gallery", help="draw all terrains in one picture")
+    p.add_argument("--out", metavar="FILE.png", default="gallery.png", help="(default %(default)s)")
+    p.add_argument("--seed", type=int, default=0)
+    p.set_defaults(run=gallery)
+
+    args = parser.parse_args(argv or ["train"])
+    args.argv = list(argv)
+    return args
+
+
+def main(argv=None):
+    argv = sys.argv[1:] if argv is None else argv
+    args = parse(argv)
+    try:
+        code = args.run(args)
+        if not argv and not code:  # the main job: train, then score
+            code = eval_command(parse(["eval", str(Path(args.run_dir) / "policy.pt")]))
+        return code
+    except (ValueError, OSError, FloatingPointError) as error:
+        print(f"loco_mtrl.py: error: {error}", file=sys.stderr)
+        return 2
+
+
+if __name__ == "__main__":
+    sys.exit(main())

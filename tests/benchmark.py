@@ -1,0 +1,132 @@
+"""How fast the project is, as a table: `python tests/benchmark.py`, about 4 minutes.
+
+Asserts nothing, for times depend on the machine: run it on an idle one and compare the ratios.
+"""
+
+import csv
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import psutil
+
+import loco_mtrl
+from loco_mtrl import LAIKAGO, PILLAR_TASKS, LocoEnv, training_env
+
+STEPS = 2000
+
+
+class NaiveEnv(LocoEnv):
+    """The same scene as one would first write it: a box per pillar, the URDF's own meshes."""
+
+    def _add_mesh(self, terrain, offset, visual):
+        p, ground = self.bullet, terrain.height
+        half = np.append(np.array(ground.cell) / 2, 0.5)
+        shape = p.createCollisionShape(p.GEOM_BOX, halfExtents=half)
+        for (i, j), height in np.ndenumerate(ground.heights):
+            x, y = (i + 0.5) * ground.cell[0], (j + 0.5) * ground.cell[1] - ground.size[1] / 2
+            p.createMultiBody(0, shape, basePosition=(x + offset, y, height - 0.5))
+
+    def _load_robot(self):
+        p = self.bullet
+        self.robot = p.loadURDF(str(LAIKAGO), [0, 0, 1000])
+        joints = [p.getJointInfo(self.robot, j) for j in range(p.getNumJoints(self.robot))]
+        ids = {joint[1].decode(): joint[0] for joint in joints}
+        names = [f"{leg}_{joint}" for leg in loco_mtrl.LEGS for joint in loco_mtrl.JOINTS]
+        self.joints = [ids[name] for name in names]
+
+
+def timed(env, name, spent):
+    """Adds the seconds inside one of Bullet's functions to `spent`."""
+    function = getattr(env.bullet, name)
+
+    def wrapper(*args, **kwargs):
+        start = time.perf_counter()
+        result = function(*args, **kwargs)
+        spent[name] = spent.get(name, 0.0) + time.perf_counter() - start
+        return result
+
+    setattr(env.bullet, name, wrapper)
+
+
+def walk(env, steps, spent=None):
+    """Seconds a step, and a reset, of gentle random actions on rugged pillars."""
+    rng = np.random.default_rng(0)
+    env.reset(seed=0)
+    for name in ("stepSimulation", "rayTestBatch") if spent is not None else ():
+        timed(env, name, spent)
+    resets, elapsed = [], 0.0
+    for _ in range(steps):
+        action = rng.normal(0, 0.2, env.action_space.shape)
+        start = time.perf_counter()
+        _, _, terminated, _, _ = env.step(action)
+        elapsed += time.perf_counter() - start
+        if terminated:
+            start = time.perf_counter()
+            env.reset()
+            resets.append(time.perf_counter() - start)
+    for _ in range(20):
+        start = time.perf_counter()
+        env.reset()
+        resets.append(time.perf_counter() - start)
+    return elapsed / steps, np.mean(resets)
+
+
+def training(ranks):
+    """Steps/s and the share of learning of a short training on all tasks, its start left out."""
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, "-m", "loco_mtrl", "train", "--run-dir", folder]
+        command += ["--ranks", str(ranks), "--steps", str(30_000 * ranks)]
+        subprocess.run(command, check=True, capture_output=True)
+        rows = list(csv.DictReader(open(Path(folder) / "progress.csv")))[3:]
+    collect, learn = (sum(float(row[k]) for row in rows) for k in ("collect_s", "learn_s"))
+    steps = float(rows[-1]["steps"]) - float(rows[0]["steps"])
+    minutes = float(rows[-1]["minutes"]) - float(rows[0]["minutes"])
+    return steps / minutes / 60, learn / (collect + learn)
+
+
+def memory():
+    """MB of one rank with all tasks, and its growth from the 500th to the 5,000th reset."""
+    make = [lambda i=i: training_env(i, 0, tasks=list(PILLAR_TASKS)) for i in range(12)]
+    envs = gymnasium.vector.SyncVectorEnv(make)
+    process, sizes = psutil.Process(), {}
+    for k in range(5001):
+        envs.envs[k % 12].reset()
+        if k in (500, 5000):
+            sizes[k] = process.memory_info().rss / 2**20
+    envs.close()
+    return sizes[500], sizes[5000] - sizes[500]
+
+
+def main():
+    rows, spent = [], {}
+    env = LocoEnv("rugged", difficulty=0.5)
+    step, reset = walk(env, STEPS)
+    measured, _ = walk(env, STEPS, spent)
+    env.close()
+    inside = sum(spent.values()) / STEPS
+    naive, _ = walk(NaiveEnv("rugged", difficulty=0.5), 200)
+    rows.append(("steps/s on one core, rugged pillars, 160 rays", f"{1 / step:.0f}"))
+    for name, seconds in spent.items():
+        rows.append((f"  ms a step in {name}", f"{seconds / STEPS * 1e3:.3f}"))
+    rows.append(("  share inside those two", f"{inside / measured:.2f}"))
+    rows.append(("one box per pillar and the URDF's meshes: slower by", f"{naive / step:.0f}x"))
+    rows.append(("reset", f"{reset * 1e3:.1f} ms"))
+    size, growth = memory()
+    rows.append(("memory of one rank, all tasks", f"{size:.0f} MB"))
+    rows.append(("  growth over resets 500 to 5,000", f"{growth:.1f} MB"))
+    one, _ = training(1)
+    two, share = training(2)
+    rows.append(("training steps/s, 1 rank", f"{one:.0f}"))
+    rows.append(("training steps/s, 2 ranks", f"{two:.0f} ({two / one:.2f}x)"))
+    rows.append(("  share of learning", f"{share:.2f}"))
+    for name, value in rows:
+        print(f"{name:55}{value:>15}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,162 @@
+"""The command line as a user calls it, and each wrong call."""
+
+import csv
+import json
+import os
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import loco_mtrl
+import ppo
+
+ROOT = Path(__file__).parent.parent
+
+
+def run(*arguments, cwd):
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    return subprocess.run(
+        [sys.executable, str(ROOT / "loco_mtrl.py"), *map(str, arguments)],
+        cwd=cwd, env=environment, capture_output=True, text=True, timeout=200,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A run of two ranks and a few updates on flat ground, as a user starts it."""
+    folder = tmp_path_factory.mktemp("runs")
+    result = run("train", "--tasks", "flat", "--steps", 5000, "--ranks", 2, "--run-dir", "a",
+                 cwd=folder)  # fmt: skip
+    assert result.returncode == 0, result.stderr
+    return folder / "a"
+
+
+def progress(run_dir):
+    with open(run_dir / "progress.csv", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_training_leaves_what_a_person_needs(trained):
+    assert {f.name for f in trained.iterdir()} >= {
+        "config.json", "progress.csv", "checkpoint.pt", "policy.pt", "curve.png"
+    }  # fmt: skip
+    rows = progress(trained)
+    assert int(rows[-1]["steps"]) >= 5000
+    assert 0 < float(rows[-1]["steps_per_s"]) and float(rows[-1]["approx_kl"]) >= 0
+    config = json.loads((trained / "config.json").read_text())
+    assert config["meta"]["tasks"] == ["flat"] and config["ppo"]["seed"] == 0
+    assert (trained / "policy.pt").stat().st_size < 1e6
+
+
+def test_resume_goes_on(trained):
+    result = run("train", "--tasks", "flat", "--steps", 9000, "--ranks", 2, "--run-dir", trained,
+                 "--resume", cwd=trained)  # fmt: skip
+    assert result.returncode == 0, result.stderr
+    steps = [int(row["steps"]) for row in progress(trained)]
+    assert steps == sorted(set(steps)) and 5000 < steps[-1] < 9000 + 2 * 12 * 160
+
+
+def test_eval_prints_the_same_table_twice_and_writes_json(trained):
+    arguments = ["eval", trained / "policy.pt", "--worlds", "flat,stairs", "--episodes", 2]
+    first = run(*arguments, "--json", trained / "one.json", "--ranks", 2, cwd=trained)
+    second = run(*arguments, "--json", trained / "two.json", "--ranks", 1, cwd=trained)
+    assert first.returncode == 0, first.stderr
+    assert first.stdout == second.stdout
+    assert "stairs" in first.stdout and "t_cr" in first.stdout
+    one, two = (json.loads((trained / f"{n}.json").read_text()) for n in ("one", "two"))
+    assert one == two
+    flat = one["worlds"]["flat"]
+    assert set(flat) >= {"t_cr", "std", "success", "fall", "collisions", "seconds", "per_policy"}
+    assert 0 <= flat["t_cr"] <= 1 and one["episodes"] == 2
+
+
+def test_references_need_no_policy(tmp_path):
+    result = run("eval", "zero", "straight", "--worlds", "flat", "--episodes", 2, cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    scores = [float(line.split()[2]) for line in result.stdout.splitlines() if "mean t_cr" in line]
+    assert scores[1] > 0.9 > scores[0] > 0.2  # steering reaches the goal, drifting does not
+
+
+def test_play_writes_a_gif_that_moves_and_a_map(trained):
+    from PIL import Image
+
+    result = run("play", "straight", "--world", "flat", "--gif", "walk.gif", "--lidar", cwd=trained)
+    assert result.returncode == 0, result.stderr
+    assert "reached the goal" in result.stdout
+    with Image.open(trained / "walk.gif") as gif:
+        assert gif.n_frames > 20
+        frames = []
+        for k in (0, gif.n_frames // 2):
+            gif.seek(k)
+            frames.append(np.asarray(gif.convert("RGB"), dtype=int))
+    assert np.abs(frames[0] - frames[1]).mean() > 1
+    with Image.open(trained / "walk.png") as picture:
+        assert picture.size[0] > 300
+
+
+@pytest.mark.parametrize(
+    "arguments, named",
+    [
+        (["fly"], "fly"),
+        (["train", "--tasks", "lava"], "lava"),
+        (["train", "--tasks", ""], "unknown task ''"),
+        (["train", "--steps", "-5"], "-5"),
+        (["train", "--steps", "0"], "0"),
+        (["train", "--steps", "many"], "many"),
+        (["train", "--steps", "nan"], "nan"),
+        (["train", "--ranks", "0"], "0"),
+        (["train", "--seed", "x"], "x"),
+        (["train", "--seed", "-1", "--ranks", "1"], "-1"),
+        (["train", "--fast"], "--fast"),
+        (["train", "--resume", "--run-dir", "nowhere"], "nowhere"),
+        (["train", "--run-dir", "/proc/nowhere", "--ranks", "1"], "/proc/nowhere"),
+        (["eval"], "POLICY"),
+        (["eval", "nothing.pt"], "nothing.pt"),
+        (["eval", "zero", "--worlds", "moon"], "moon"),
+        (["eval", "zero", "--episodes", "0"], "0"),
+        (["play", "zero", "--world", "moon"], "moon"),
+        (["play", "zero", "--mesh", "nothing.obj"], "nothing.obj"),
+    ],
+)
+def test_wrong_calls_end_with_one_clear_line(arguments, named, capsys):
+    try:
+        code = loco_mtrl.main(arguments)
+    except SystemExit as stop:
+        code = stop.code
+    error = capsys.readouterr().err
+    assert code == 2
+    assert named in error.strip().splitlines()[-1]
+    assert "Traceback" not in error
+
+
+def test_wrong_checkpoints_are_named(trained, tmp_path, capsys):
+    whole = (trained / "checkpoint.pt").read_bytes()
+    (tmp_path / "cut.pt").write_bytes(whole[:1000])
+    (tmp_path / "text.pt").write_text("not a checkpoint")
+    (tmp_path / "code.pt").write_bytes(pickle.dumps(os.system))
+    torch.save({"model": 1}, tmp_path / "other.pt")
+    model = ppo.ActorCritic(obs_dim=7, act_dim=2)
+    ppo.save_checkpoint(tmp_path / "sizes.pt", model, ppo.PPOConfig(), meta={
+        "tg": True, "lidar": True, "tasks": ["flat"], "sequential": False})  # fmt: skip
+    for name in ("cut", "text", "code", "other", "sizes"):
+        assert loco_mtrl.main(["eval", str(tmp_path / f"{name}.pt")]) == 2
+        error = capsys.readouterr().err
+        assert f"{name}.pt" in error and error.count("\n") == 1
+
+
+def test_a_run_is_not_overwritten(trained):
+    result = run("train", "--tasks", "flat", "--steps", 100, "--run-dir", trained, cwd=trained)
+    assert result.returncode == 2
+    assert "already holds a run" in result.stderr and "Traceback" not in result.stderr
+
+
+def test_help_names_every_command(tmp_path):
+    result = run("--help", cwd=tmp_path)
+    assert result.returncode == 0
+    for command in ("train", "eval", "play", "gallery"):
+        assert command in result.stdout

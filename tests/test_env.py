@@ -1,0 +1,294 @@
+"""The environment: its senses against geometry, its reward and endings against the paper."""
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+import loco_mtrl
+import terrain
+from loco_mtrl import DT, GOAL_RADIUS, LIDAR_POSITION, LIDAR_RANGE, N_RAYS, LocoEnv
+
+SHAPE = (60, 40)
+
+
+def wall_ahead(rng, difficulty):
+    """A wall from 6 m on, across the whole terrain but for a passage at its side."""
+    heights = np.zeros(SHAPE)
+    heights[30:32, :32] = 2.0
+    return heights
+
+
+@pytest.fixture(scope="module")
+def flat():
+    env = LocoEnv("flat")
+    yield env
+    env.close()
+
+
+def place(env, x, y, z, yaw=0.0, roll=0.0):
+    """Puts the robot's base somewhere and takes an observation without any physics."""
+    p = env.bullet
+    quaternion = p.getQuaternionFromEuler((roll, 0, yaw))
+    p.resetBasePositionAndOrientation(env.robot, env.origin + [x, y, z], quaternion)
+    p.resetBaseVelocity(env.robot, (0, 0, 0), (0, 0, 0))
+    return env._observe()
+
+
+@pytest.mark.parametrize("options", [{}, {"tg": False}, {"lidar": False}])
+def test_gymnasium_checks_pass_without_a_warning(options):
+    env = gymnasium.make("LocoMTRL-v0", tasks="rugged", render_mode="rgb_array", **options)
+    check_env(env.unwrapped)
+    env.close()
+
+
+def test_observation_has_the_papers_parts_in_its_order(flat):
+    observation, _ = flat.reset(seed=3)
+    scan, goal, rates, joints, target, s_tg = np.split(
+        observation, np.cumsum([N_RAYS, 2, 3, 12, 12])
+    )
+    assert scan.min() >= 0 and scan.max() <= 1
+    offset = flat.goal - flat.position
+    assert goal[0] == pytest.approx(np.linalg.norm(offset))
+    np.testing.assert_allclose(rates, 0, atol=1e-6)
+    np.testing.assert_allclose(joints, target, atol=1e-6)  # an episode starts in the TG's pose
+    np.testing.assert_allclose(s_tg, flat.generator.state(), atol=1e-6)
+
+
+def test_heading_is_left_positive_and_relative_to_the_robot(flat):
+    flat.reset(seed=0)
+    flat.goal = flat.origin + [6.0, 2.0, 0.5]
+    heading = lambda yaw: place(flat, 6.0, 0.0, 0.5, yaw)[N_RAYS + 1]  # noqa: E731
+    assert heading(0.0) == pytest.approx(np.pi / 2, abs=1e-6)
+    assert heading(np.pi / 2) == pytest.approx(0.0, abs=1e-6)
+    assert heading(-np.pi / 4) == pytest.approx(3 * np.pi / 4, abs=1e-6)
+
+
+def test_imu_gives_rates_in_the_frame_of_the_base(flat):
+    flat.reset(seed=0)
+    place(flat, 6, 0, 0.5, yaw=np.pi / 2)
+    flat.bullet.resetBaseVelocity(flat.robot, (0, 0, 0), (1.0, 2.0, 3.0))
+    rates = flat._observe()[N_RAYS + 2 : N_RAYS + 5]
+    np.testing.assert_allclose(rates, [2.0, -1.0, 3.0], atol=1e-5)
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.floats(0.2, 0.9), st.floats(-3, 3))
+def test_lidar_over_a_plane(flat, height, yaw):
+    flat.reset(seed=0)
+    scan = place(flat, 6.0, 0.0, height, yaw)[:N_RAYS]
+    with np.errstate(divide="ignore"):
+        drop = -loco_mtrl.lidar_directions()[:, 2]
+        expected = np.where(drop > 0, (height + LIDAR_POSITION[2]) / drop / LIDAR_RANGE, 1.0)
+    np.testing.assert_allclose(scan, np.minimum(expected, 1.0), atol=2e-4)
+
+
+def test_lidar_sees_a_wall_at_its_distance():
+    env = LocoEnv(wall_ahead)
+    env.reset(seed=0)
+    yaw = 0.3
+    scan = place(env, 4.5, -1.0, 0.5, yaw)[:N_RAYS]
+    directions = loco_mtrl.lidar_directions()
+    turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
+    origin = np.array([4.5, -1.0, 0.5]) + turn @ LIDAR_POSITION
+    directions = directions @ turn.T
+    with np.errstate(divide="ignore"):
+        to_wall = np.where(directions[:, 0] > 0, (6.0 - origin[0]) / directions[:, 0], np.inf)
+        to_floor = np.where(directions[:, 2] < 0, -origin[2] / directions[:, 2], np.inf)
+    inside = np.abs((origin + to_wall[:, None].clip(0, 9) * directions)[:, 1] + 0.8) < 3.1
+    expected = np.minimum(np.where(inside, to_wall, np.inf), to_floor).clip(0, LIDAR_RANGE)
+    compared = inside | ~np.isfinite(to_wall)
+    np.testing.assert_allclose(scan[compared], expected[compared] / LIDAR_RANGE, atol=2e-4)
+    assert (expected[compared] == to_wall[compared]).sum() > 30
+    env.close()
+
+
+def test_lidar_never_sees_the_robot(flat):
+    """The scan stays that of the plane with a leg stretched out right before the sensor."""
+    flat.reset(seed=0)
+    before = place(flat, 6.0, 0.0, 0.9)[:N_RAYS]
+    for joint, angle in zip(flat.joints, [0.0, -1.5, -0.15] * 4, strict=True):
+        flat.bullet.resetJointState(flat.robot, joint, angle)
+    starts = [(LIDAR_POSITION[0] + 6 + flat.origin[0], 0, 0.98)] * N_RAYS
+    ends = np.array(starts) + LIDAR_RANGE * loco_mtrl.lidar_directions()
+    seen = [hit[0] for hit in flat.bullet.rayTestBatch(starts, ends.tolist())]
+    assert flat.robot in seen  # without the filter it would see its leg
+    np.testing.assert_array_equal(flat._observe()[:N_RAYS], before)
+
+
+def test_reward_is_velocity_toward_the_goal_and_sums_to_the_progress():
+    env = LocoEnv("rugged", difficulty=0.5)
+    env.reset(seed=1)
+    first, total = env.distance, 0.0
+    for _ in range(120):
+        before = env.distance
+        _, reward, terminated, _, info = env.step(np.zeros(17))
+        assert reward == pytest.approx((before - env.distance) / DT)
+        total += reward * DT
+        assert not terminated
+    assert total == pytest.approx(first - env.distance)
+    assert total > 0.5  # the zero action has walked toward the goal, and that is positive
+    assert info["t_cr"] == pytest.approx(1 - env.distance / first)
+    env.close()
+
+
+def test_zero_action_walks_by_itself():
+    """At least 0.3 m/s for 8 s on flat ground, from any phase of the stride."""
+    env = LocoEnv("flat")
+    for seed in range(4):
+        env.reset(seed=seed)
+        start = np.array(env.position)
+        for _ in range(round(8 / DT)):
+            _, _, terminated, _, info = env.step(np.zeros(17))
+            assert not info["fall"]
+            if terminated:
+                break
+        assert np.hypot(*(np.array(env.position) - start)[:2]) / env.time >= 0.3
+    env.close()
+
+
+def test_success_ends_the_episode_at_the_goal(flat):
+    flat.reset(seed=0)
+    place(flat, *(flat.goal - flat.origin - [GOAL_RADIUS - 0.1, 0, 0]))
+    _, _, terminated, truncated, info = flat.step(np.zeros(17))
+    assert terminated and not truncated
+    assert info["success"] and not info["fall"] and info["t_cr"] == 1.0
+
+
+def test_tipping_over_is_a_fall(flat):
+    flat.reset(seed=0)
+    place(flat, 5, 0, 0.6, roll=1.4)
+    _, _, terminated, _, info = flat.step(np.zeros(17))
+    assert terminated and info["fall"] and not info["success"]
+
+
+def test_dropping_off_an_edge_is_a_fall():
+    env = LocoEnv("flat")
+    env.reset(seed=0)
+    place(env, -3.0, 0, 0.6)  # beside the terrain: nothing below
+    steps = 0
+    terminated = False
+    while not terminated:
+        _, _, terminated, _, info = env.step(np.zeros(17))
+        steps += 1
+    assert info["fall"]
+    # g t = 2.5 m/s after 0.255 s
+    assert steps == pytest.approx(0.255 / DT, abs=1)
+    env.close()
+
+
+def test_time_limit_truncates():
+    env = gymnasium.make("LocoMTRL-v0", tasks="flat", max_episode_steps=7)
+    env.reset(seed=0)
+    for step in range(1, 8):
+        _, _, terminated, truncated, _ = env.step(np.zeros(17, np.float32))
+        assert truncated == (step == 7) and not terminated
+    env.close()
+    assert gymnasium.spec("LocoMTRL-v0").max_episode_steps == 600
+
+
+def episode(env, seed, steps=300):
+    rng = np.random.default_rng(0)
+    observations = [env.reset(seed=seed)[0]]
+    for _ in range(steps):
+        observation, _, terminated, _, _ = env.step(rng.uniform(-1, 1, 17))
+        observations.append(observation)
+        if terminated:
+            observations.append(env.reset()[0])
+    return np.array(observations)
+
+
+def test_same_seed_same_observations():
+    one, other = LocoEnv(["rugged", "stairs"]), LocoEnv(["rugged", "stairs"])
+    for seed in range(3):
+        first = episode(one, seed)
+        np.testing.assert_array_equal(first, episode(one, seed))  # in a used environment
+        np.testing.assert_array_equal(first, episode(other, seed))  # in another one
+    assert not np.array_equal(first, episode(one, seed=6))
+    one.close(), other.close()
+
+
+def test_every_task_is_drawn_and_named():
+    env = LocoEnv(["flat", "holes", wall_ahead])
+    tasks = {env.reset(seed=s)[1]["task"] for s in range(30)}
+    assert tasks == {"flat", "holes", "wall_ahead"}
+    env.close()
+
+
+def test_a_finished_terrain_can_be_walked():
+    place_ = terrain.make_terrain("stairs", np.random.default_rng(0), 0.3)
+    env = LocoEnv(place_)
+    env.reset(seed=0, options={"terrain": 0, "route": 2})
+    np.testing.assert_allclose(env.goal[:2] - env.origin[:2], place_.goals[2][:2])
+    env.close()
+
+
+@settings(max_examples=15, deadline=None)
+@given(arrays(np.float32, 17, elements=st.floats(-1e6, 1e6, width=32)))
+def test_any_finite_action_gives_an_observation_in_the_space(flat, action):
+    flat.reset(seed=0)
+    for _ in range(20):
+        observation, reward, terminated, _, _ = flat.step(action)
+        assert observation in flat.observation_space and np.isfinite(reward)
+        if terminated:
+            break
+
+
+def test_mirror_is_its_own_inverse_and_fits_the_spaces():
+    for options in ({}, {"tg": False}, {"lidar": False}):
+        env = LocoEnv("flat", **options)
+        i, s, j, t = env.mirror()
+        observation = np.arange(env.observation_space.shape[0], dtype=float)
+        action = np.arange(env.action_space.shape[0], dtype=float)
+        np.testing.assert_array_equal((observation[i] * s)[i] * s, observation)
+        np.testing.assert_array_equal((action[j] * t)[j] * t, action)
+        env.close()
+
+
+def test_mirror_is_what_a_mirrored_robot_would_observe(flat):
+    """Everything reflected in the x-z plane: pose, goal, legs, stride."""
+    flat.reset(seed=0)
+    i, s, j, t = flat.mirror()
+    action = np.random.default_rng(1).uniform(-1, 1, 17)
+    observations = []
+    for side, act in ((1, action), (-1, action[j] * t)):
+        flat.generator.reset(0.7 + (np.pi if side < 0 else 0.0))
+        flat.goal = flat.origin + [9.0, 1.5 * side, 0.45]
+        flat.target = flat.generator.step(act[:5], 0.01)
+        joints = np.random.default_rng(2).uniform(-0.5, 0.5, 12).reshape(4, 3)
+        joints = (joints if side > 0 else joints[[1, 0, 3, 2]]).ravel()
+        for joint, angle in zip(flat.joints, joints, strict=True):
+            flat.bullet.resetJointState(flat.robot, joint, angle)
+        place(flat, 6.0, 0.2 * side, 0.6, yaw=0.4 * side, roll=0.1 * side)
+        flat.bullet.resetBaseVelocity(flat.robot, (0, 0, 0), (0.3 * side, 0.5, 0.7 * side))
+        observations.append(flat._observe())
+    # The TG's targets mirror to a few hundredths: right and left legs are not built quite alike.
+    np.testing.assert_allclose(observations[0][i] * s, observations[1], atol=0.02)
+
+
+@pytest.mark.parametrize(
+    "options, named",
+    [
+        ({"tasks": "lava"}, "lava"),
+        ({"tasks": ["flat", "lava"]}, "lava"),
+        ({"tasks": []}, "task"),
+        ({"difficulty": 2}, "2"),
+        ({"difficulty": (0.5, 0.2)}, "0.5"),
+        ({"difficulty": float("nan")}, "nan"),
+        ({"terrains": 0}, "0"),
+        ({"render_mode": "ascii"}, "ascii"),
+    ],
+)
+def test_bad_arguments_are_named(options, named):
+    with pytest.raises(ValueError, match=named):
+        LocoEnv(**options)
+
+
+@pytest.mark.parametrize("action", [np.zeros(16), np.full(17, np.nan), np.full(17, np.inf), 0.0])
+def test_bad_actions_are_named(flat, action):
+    flat.reset(seed=0)
+    with pytest.raises(ValueError, match="17 finite"):
+        flat.step(action)

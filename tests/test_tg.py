@@ -1,0 +1,161 @@
+"""Kinematics against Bullet's own, and what the trajectory generator promises."""
+
+import numpy as np
+import pybullet
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+import tg
+from loco_mtrl import JOINTS, LAIKAGO
+
+POSES = arrays(np.float64, 12, elements=st.floats(-1.2, 1.2))
+ACTIONS = arrays(np.float64, 5, elements=st.floats(-1, 1))
+
+
+@pytest.fixture(scope="module")
+def bullet_feet():
+    """Feet in the hip frames as Bullet computes them from the original URDF."""
+    client = pybullet.connect(pybullet.DIRECT)
+    robot = pybullet.loadURDF(str(LAIKAGO), useFixedBase=True, physicsClientId=client)
+    joints = {}
+    for j in range(pybullet.getNumJoints(robot, physicsClientId=client)):
+        joints[pybullet.getJointInfo(robot, j, physicsClientId=client)[1].decode()] = j
+    base = pybullet.getBasePositionAndOrientation(robot, physicsClientId=client)[0]
+
+    def feet(angles):
+        names = [f"{leg}_{joint}" for leg in tg.LEGS for joint in JOINTS]
+        for name, angle in zip(names, angles, strict=True):
+            pybullet.resetJointState(robot, joints[name], angle, physicsClientId=client)
+        toes = [
+            pybullet.getLinkState(
+                robot, joints[f"jtoe{leg}"], computeForwardKinematics=True, physicsClientId=client
+            )[4]
+            for leg in tg.LEGS
+        ]
+        return np.array(toes) - base - tg.HIP_POSITION
+
+    yield feet
+    pybullet.disconnect(client)
+
+
+@settings(max_examples=60, deadline=None)
+@given(POSES)
+def test_forward_kinematics_agree_with_bullet(bullet_feet, pose):
+    np.testing.assert_allclose(tg.foot_position(pose), bullet_feet(pose), atol=1e-4)
+
+
+def test_standing_pose_by_hand():
+    feet = tg.foot_position(tg.STANDING)
+    # x = -(U sin h + L sin(h + k)), h = 0.07 + 0.598933, h + k = h - 0.59 - 0.511159
+    assert feet[0] == pytest.approx([-0.1564 + 0.1052, -0.032875, -0.1979 - 0.2278], abs=2e-4)
+    assert feet[1, 1] == pytest.approx(0.035165)
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    st.floats(-0.6, 0.6), st.floats(-1.4, 0.8), st.floats(-1.8, 0.2), st.sampled_from(range(4))
+)
+def test_inverse_returns_the_joints(abduction, hip, knee, leg):
+    joints = np.tile(tg.STANDING.reshape(4, 3)[0], (4, 1))
+    joints[leg] = abduction, hip, knee
+    feet = tg.foot_position(joints.ravel())
+    if feet[leg, 2] > -0.1:  # a foot above the hip belongs to two poses
+        return
+    np.testing.assert_allclose(tg.joint_angles(feet), joints.ravel(), atol=1e-6)
+
+
+@settings(max_examples=200, deadline=None)
+@given(arrays(np.float64, (4, 3), elements=st.floats(-5, 5)))
+def test_inverse_is_finite_and_points_at_a_foot_out_of_reach(feet):
+    reached = tg.foot_position(tg.joint_angles(feet))
+    assert np.isfinite(reached).all()
+    assert (np.linalg.norm(reached, axis=1) < 0.51).all()
+
+
+def test_out_of_reach_leg_is_straight_and_along_the_wish():
+    feet = np.stack([np.full(4, 0.6), tg.LATERAL, np.full(4, -0.8)], axis=1)  # 1 m away
+    reached = tg.foot_position(tg.joint_angles(feet))
+    length = tg.UPPER + tg.LOWER
+    np.testing.assert_allclose(reached[:, 0], 0.6 * length, atol=1e-6)
+    np.testing.assert_allclose(reached[:, 2], -0.8 * length, atol=1e-6)
+
+
+def test_kinematics_take_batches():
+    poses = np.random.default_rng(0).uniform(-0.5, 0.5, (7, 3, 12))
+    feet = tg.foot_position(poses)
+    assert feet.shape == (7, 3, 4, 3)
+    np.testing.assert_array_equal(feet[2, 1], tg.foot_position(poses[2, 1]))
+    np.testing.assert_array_equal(tg.joint_angles(feet)[2, 1], tg.joint_angles(feet[2, 1]))
+
+
+def test_stance_slides_back_and_swing_lifts():
+    generator = tg.TrajectoryGenerator()
+    generator.reset(0.0)  # FR and RL touch down, the others are 0.5 / 0.4 = 5 / 6 ... of stance
+    feet = generator.feet()
+    assert feet[0, 0] == pytest.approx(0.10)  # half of the 0.20 m stride ahead
+    assert feet[1, 0] == pytest.approx(0.20 * (0.5 - 0.5 / 0.6))
+    np.testing.assert_allclose(feet[:, 2], -0.32)
+    generator.reset(2 * np.pi * 0.8)  # FR is half through its swing, FL at 0.3 of the cycle
+    feet = generator.feet()
+    assert feet[0] == pytest.approx([0.0, tg.LATERAL[0] - tg.OUTWARD, -0.32 + 0.12])
+    assert feet[1] == pytest.approx([0.0, tg.LATERAL[1] + tg.OUTWARD, -0.32])
+
+
+@settings(max_examples=50, deadline=None)
+@given(ACTIONS, st.floats(0, 6.28))
+def test_feet_move_without_jumps(action, phase):
+    generator = tg.TrajectoryGenerator()
+    generator.reset(phase)
+    generator.step(action, 0.0)
+    path = []
+    for _ in range(1000):
+        generator.step(action, 1e-3)
+        path.append(generator.feet())
+    # 0.5 m of stride in a swing of 0.4 / 4 s at most, 0.2 m of lift along half a sine
+    assert np.abs(np.diff(path, axis=0)).max() < 1e-3 * max(0.5 / 0.1, np.pi * 0.2 / 0.1) + 1e-9
+
+
+@settings(max_examples=50, deadline=None)
+@given(arrays(np.float64, 5, elements=st.floats(-100, 100)))
+def test_parameters_stay_in_their_limits(action):
+    generator = tg.TrajectoryGenerator()
+    generator.step(action, 0.03)
+    assert (np.abs(generator.parameters - tg.CENTRE) <= tg.RANGE + 1e-12).all()
+    assert np.abs(generator.state()).max() <= 1 + 1e-9
+    assert generator.state().shape == (generator.state_size,)
+
+
+def test_phase_advances_by_the_frequency():
+    generator = tg.TrajectoryGenerator()
+    for _ in range(30):
+        generator.step([0.5, 0, 0, 0, 0], 1 / 30)  # 3.5 Hz for 1 s
+    assert generator.phase == pytest.approx(np.pi, abs=1e-9)
+    assert generator.state()[:4] == pytest.approx([-1, 1, 1, -1])
+
+
+def test_left_and_right_are_mirror_images():
+    one, other = tg.TrajectoryGenerator(), tg.TrajectoryGenerator()
+    other.reset(np.pi)
+    a = one.step([0.1, 0.9, -0.4, 0.2, -0.3], 0.02).reshape(4, 3)
+    b = other.step([0.1, -0.4, 0.9, 0.2, -0.3], 0.02).reshape(4, 3)
+    # Not exact: the right leg plane is 2 mm nearer to its axis than the left one.
+    np.testing.assert_allclose(a, b[[1, 0, 3, 2]], atol=0.01)
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda: tg.foot_position(np.zeros(11)),
+        lambda: tg.foot_position(0.0),
+        lambda: tg.joint_angles(np.zeros((3, 4))),
+        lambda: tg.joint_angles(np.zeros(12)),
+        lambda: tg.TrajectoryGenerator().step(np.zeros(4), 0.01),
+        lambda: tg.TrajectoryGenerator().step([np.nan] * 5, 0.01),
+        lambda: tg.TrajectoryGenerator().step([np.inf, 0, 0, 0, 0], 0.01),
+    ],
+)
+def test_bad_input_is_named(call):
+    with pytest.raises(ValueError, match="must"):
+        call()

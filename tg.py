@@ -1,0 +1,157 @@
+"""Leg kinematics of the Laikago and the trajectory generator that shapes its gait.
+
+Knows no simulator: NumPy only. Arrays over legs are in the order FR, FL, RR, RL; joints of a leg
+are abduction, hip, knee, in radians as in the URDF; a foot (the centre of its toe) is (x forward,
+y left, z up) in metres in its hip frame, whose origin is the leg's abduction joint.
+"""
+
+import math
+
+import numpy as np
+
+LEGS = ("FR", "FL", "RR", "RL")
+SIDE = np.array([-1.0, 1.0, -1.0, 1.0])  # +1 on the left; abduction moves a foot outwards
+# Read off laikago_toes_zup.urdf (metres, radians).
+HIP_POSITION = np.array(
+    [
+        [0.199095, -0.0817145, -0.03],
+        [0.199095, 0.0817145, -0.03],
+        [-0.238195, -0.0817145, -0.03],
+        [-0.238195, 0.0817145, -0.03],
+    ]
+)  # of the abduction joints, in the frame of the base
+LATERAL = np.array([-0.032875, 0.035165, -0.032875, 0.035165])  # leg plane from abduction axis
+UPPER, LOWER = 0.252234, 0.250966  # lengths of the links
+HIP_ZERO, KNEE_ZERO = 0.598933, -0.511159  # angle of the straight link minus the joint's
+STANDING = np.tile([0.0, 0.07, -0.59], 4)  # joint angles (12,) of the standing pose, rad
+
+
+def foot_position(joints):
+    """Forward kinematics of all four legs.
+
+    Args:
+        joints: (..., 12) joint angles, rad.
+    Returns:
+        (..., 4, 3) feet in their hip frames, m.
+    Raises:
+        ValueError: if the last axis is not 12 long.
+    """
+    joints = np.asarray(joints, dtype=np.float64)
+    if joints.ndim == 0 or joints.shape[-1] != 12:
+        raise ValueError(f"joints must have shape (..., 12), got {joints.shape}")
+    abduction, hip, knee = np.moveaxis(joints.reshape(*joints.shape[:-1], 4, 3), -1, 0)
+    roll, hip = SIDE * abduction, hip + HIP_ZERO
+    shin = hip + knee + KNEE_ZERO
+    x = -(UPPER * np.sin(hip) + LOWER * np.sin(shin))
+    down = -(UPPER * np.cos(hip) + LOWER * np.cos(shin))  # along the leg plane, before the roll
+    y = LATERAL * np.cos(roll) - down * np.sin(roll)
+    z = LATERAL * np.sin(roll) + down * np.cos(roll)
+    return np.stack([x, y, z], axis=-1)
+
+
+def joint_angles(feet):
+    """Inverse kinematics of all four legs in closed form, knees bent backwards.
+
+    A foot out of reach is clamped: the leg points at it, stretched straight (or folded).
+
+    Args:
+        feet: (..., 4, 3) feet in their hip frames, m.
+    Returns:
+        (..., 12) joint angles, rad; always finite for finite feet.
+    Raises:
+        ValueError: if the last axes are not (4, 3).
+    """
+    feet = np.asarray(feet, dtype=np.float64)
+    if feet.shape[-2:] != (4, 3):
+        raise ValueError(f"feet must have shape (..., 4, 3), got {feet.shape}")
+    x, y, z = feet[..., 0], feet[..., 1], feet[..., 2]
+    # Inside the cylinder that the leg plane sweeps around the abduction axis nothing is in reach.
+    square = np.maximum(y * y + z * z - LATERAL**2, 1e-12)
+    down = -np.sqrt(square)
+    # The roll turns (LATERAL, down) to (y, z): the angle between them, from cross and dot product.
+    roll = np.arctan2(LATERAL * z - down * y, LATERAL * y + down * z)
+    cos_knee = (x * x + square - (UPPER**2 + LOWER**2)) / (2 * UPPER * LOWER)
+    cos_knee = np.minimum(np.maximum(cos_knee, -1.0), 1.0)
+    knee = -np.arccos(cos_knee)
+    hip = np.arctan2(-x, -down) - np.arctan2(LOWER * np.sin(knee), UPPER + LOWER * cos_knee)
+    angles = np.empty(feet.shape)
+    angles[..., 0], angles[..., 1], angles[..., 2] = SIDE * roll, hip - HIP_ZERO, knee - KNEE_ZERO
+    return angles.reshape(*feet.shape[:-2], 12)
+
+
+# What the policy modulates: (value at a zero action, half the range that an action in [-1, 1]
+# spans). The zero action is a trot that walks by itself; the ranges let it stop, back up and climb.
+PARAMETERS = {
+    "frequency": (3.0, 1.0),  # Hz, strides a second
+    "left_stride": (0.20, 0.30),  # m, travel of the left feet during stance; negative walks back
+    "right_stride": (0.20, 0.30),  # m; unlike the left one, it turns the robot
+    "swing_height": (0.12, 0.08),  # m, lift of the feet in mid-swing
+    "stance_height": (0.32, 0.08),  # m, hips above the feet; crouched falls least
+}
+CENTRE, RANGE = np.array(list(PARAMETERS.values())).T
+PHASE_OFFSET = np.array([0.0, np.pi, np.pi, 0.0])  # trot: diagonal legs move together
+DUTY = 0.6  # share of a stride that a foot stands; more than half: never fewer than two feet down
+OUTWARD = 0.09  # m that feet stand outside their leg plane: a wide stance is what survives pushes
+
+
+class TrajectoryGenerator:
+    """Periodic foot paths for a trotting gait, modulated by a policy (paper section 2.2).
+
+    A common phase advances at `frequency`; each leg adds its own offset. During stance a foot
+    slides back by the stride length of its side, during swing it returns, lifted along half a
+    sine. Feet become joint angles by inverse kinematics.
+
+    Attributes:
+        phase: common phase, rad in [0, 2 pi).
+        parameters: (5,) the values of PARAMETERS in force, and scaled: the same in [-1, 1].
+    """
+
+    action_size = len(PARAMETERS)
+    state_size = 2 * len(LEGS) + len(PARAMETERS)
+
+    def __init__(self):
+        self.reset()
+
+    def reset(self, phase=0.0):
+        """Starts the stride at `phase` (rad) with the parameters of the zero action."""
+        self.phase = float(phase) % (2 * np.pi)
+        self.scaled, self.parameters = np.zeros(CENTRE.size), CENTRE.copy()
+
+    def step(self, action, dt):
+        """Advances the phase by `dt` seconds under new parameters.
+
+        Args:
+            action: (5,) in [-1, 1], in the order of PARAMETERS; clipped to that range.
+            dt: s.
+        Returns:
+            u_tg: (12,) joint targets, rad.
+        Raises:
+            ValueError: if `action` has another shape or is not finite.
+        """
+        action = np.asarray(action, dtype=np.float64)
+        if action.shape != CENTRE.shape or not np.isfinite(action).all():
+            raise ValueError(f"action must be {CENTRE.size} finite numbers, got {action}")
+        self.scaled = np.minimum(np.maximum(action, -1.0), 1.0)
+        self.parameters = CENTRE + RANGE * self.scaled
+        self.phase = (self.phase + 2 * np.pi * self.parameters[0] * dt) % (2 * np.pi)
+        return joint_angles(self.feet())
+
+    def feet(self):
+        """Foot targets (4, 3) in the hip frames at the present phase and parameters, m."""
+        _, left, right, lift, height = self.parameters
+        feet = np.empty((4, 3))
+        feet[:, 1] = LATERAL + SIDE * OUTWARD
+        for leg, stride in enumerate((right, left, right, left)):  # plain floats: 4 are too few
+            cycle = (self.phase + PHASE_OFFSET[leg]) / (2 * math.pi) % 1.0  # 0: touches down
+            if cycle < DUTY:
+                feet[leg, 0], feet[leg, 2] = stride * (0.5 - cycle / DUTY), -height
+            else:
+                swing = (cycle - DUTY) / (1 - DUTY)
+                feet[leg, 0] = stride * (swing - 0.5)
+                feet[leg, 2] = lift * math.sin(math.pi * swing) - height
+        return feet
+
+    def state(self):
+        """s_tg (13,): cosine and sine of each leg's phase, then `scaled`."""
+        phases = self.phase + PHASE_OFFSET
+        return np.concatenate([np.cos(phases), np.sin(phases), self.scaled])
