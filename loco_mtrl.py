@@ -303,7 +303,7 @@ class LocoEnv(gymnasium.Env):
         route = options.get("route", rng.integers(len(terrain.starts)))
         self.origin = np.array([self.offsets[index], 0.0, 0.0])
         x, y, z, yaw = terrain.starts[route]
-        self.goal = terrain.goals[route] + self.origin + [0, 0, BASE_HEIGHT]
+        self.goal = (terrain.goals[route] + self.origin + [0, 0, BASE_HEIGHT]).tolist()
         yaw += rng.uniform(-0.5, 0.5)
 
         self.target = STANDING
@@ -322,16 +322,16 @@ class LocoEnv(gymnasium.Env):
         self.start_distance = self.distance
         if self.visual:
             p.resetBasePositionAndOrientation(self.flag, self.goal, (0, 0, 0, 1))
-            dx, dy, _ = self.goal - self.position
+            dx, dy, _ = np.subtract(self.goal, self.position)
             self.view_yaw = math.degrees(math.atan2(dy, dx)) - 90
         return observation, self._info(False, False)
 
     def step(self, action):
         p = self.bullet
         action = np.asarray(action, dtype=np.float64)
-        if action.shape != self.action.shape or not np.isfinite(action).all():
+        if action.shape != self.action.shape or not math.isfinite(action.sum()):
             raise ValueError(f"action must be {self.action.size} finite numbers, got {action}")
-        self.action += SMOOTHING * (np.clip(action, -1.0, 1.0) - self.action)
+        self.action += SMOOTHING * (np.minimum(np.maximum(action, -1.0), 1.0) - self.action)
         if self.generator:
             n = self.generator.action_size
             u_fb = RESIDUAL[True] * self.action[n:]
@@ -381,12 +381,15 @@ class LocoEnv(gymnasium.Env):
         self.velocity, rates = p.getBaseVelocity(self.robot)
         r = p.getMatrixFromQuaternion(quaternion)
         self.position, self.up = position, r[8]
-        dx, dy, dz = (g - b for g, b in zip(self.goal, position, strict=True))
-        self.distance = math.sqrt(dx * dx + dy * dy + dz * dz)
-        heading = math.atan2(dy, dx) - math.atan2(r[3], r[0])
+        self.distance = math.dist(self.goal, position)
+        heading = math.atan2(self.goal[1] - position[1], self.goal[0] - position[0])
+        heading -= math.atan2(r[3], r[0])
         state = [self.distance, (heading + math.pi) % (2 * math.pi) - math.pi]
         state += [r[i] * rates[0] + r[3 + i] * rates[1] + r[6 + i] * rates[2] for i in range(3)]
         state += [joint[0] for joint in p.getJointStates(self.robot, self.joints)]
+        state += self.target.tolist()
+        if self.generator:
+            state += self.generator.state()
         scan = []
         if self.n_rays:
             self.hits = p.rayTestBatch(
@@ -396,8 +399,7 @@ class LocoEnv(gymnasium.Env):
                 collisionFilterMask=STATIC_GROUP,
             )
             scan = [hit[2] for hit in self.hits]
-        s_tg = self.generator.state() if self.generator else ()
-        return np.concatenate([scan, state, self.target, s_tg], dtype=np.float32)
+        return np.array(scan + state, dtype=np.float32)
 
     def render(self):
         """The robot from above and behind, as uint8 (360, 480, 3)."""
@@ -448,7 +450,8 @@ class LocoEnv(gymnasium.Env):
             self.bullet = None
 
 
-gymnasium.register("LocoMTRL-v0", "loco_mtrl:LocoEnv", max_episode_steps=MAX_EPISODE_STEPS)
+if "LocoMTRL-v0" not in gymnasium.registry:  # run as a script, this file is imported once more
+    gymnasium.register("LocoMTRL-v0", "loco_mtrl:LocoEnv", max_episode_steps=MAX_EPISODE_STEPS)
 
 
 # ------------------------------------------------------------------------------- train
@@ -518,10 +521,9 @@ def launch(args):
     from torch.distributed.elastic.multiprocessing.errors import ChildFailedError
 
     logging.getLogger("torch.distributed.elastic").setLevel(logging.CRITICAL)
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # what torchrun would set, with a warning
     try:
-        torchrun.main(
-            ["--standalone", f"--nproc-per-node={args.ranks}", "-m", "loco_mtrl", *args.argv]
-        )
+        torchrun.main(["--standalone", f"--nproc-per-node={args.ranks}", __file__, *args.argv])
     except SignalException as signal:
         return 128 + signal.sigval
     except ChildFailedError as error:
@@ -862,4 +864,6 @@ def main(argv=None):
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    import loco_mtrl  # by the name that gymnasium and the worker processes know
+
+    sys.exit(loco_mtrl.main())

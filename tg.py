@@ -89,7 +89,7 @@ PARAMETERS = {
     "stance_height": (0.32, 0.08),  # m, hips above the feet; crouched falls least
 }
 CENTRE, RANGE = np.array(list(PARAMETERS.values())).T
-PHASE_OFFSET = np.array([0.0, np.pi, np.pi, 0.0])  # trot: diagonal legs move together
+PHASE_OFFSET = (0.0, math.pi, math.pi, 0.0)  # trot: diagonal legs move together
 DUTY = 0.6  # share of a stride that a foot stands; more than half: never fewer than two feet down
 OUTWARD = 0.09  # m that feet stand outside their leg plane: a wide stance is what survives pushes
 
@@ -129,7 +129,7 @@ class TrajectoryGenerator:
             ValueError: if `action` has another shape or is not finite.
         """
         action = np.asarray(action, dtype=np.float64)
-        if action.shape != CENTRE.shape or not np.isfinite(action).all():
+        if action.shape != CENTRE.shape or not math.isfinite(action.sum()):
             raise ValueError(f"action must be {CENTRE.size} finite numbers, got {action}")
         self.scaled = np.minimum(np.maximum(action, -1.0), 1.0)
         self.parameters = CENTRE + RANGE * self.scaled
@@ -152,6 +152,6 @@ class TrajectoryGenerator:
         return feet
 
     def state(self):
-        """s_tg (13,): cosine and sine of each leg's phase, then `scaled`."""
-        phases = self.phase + PHASE_OFFSET
-        return np.concatenate([np.cos(phases), np.sin(phases), self.scaled])
+        """s_tg, a list of 13: cosine and sine of each leg's phase, then `scaled`."""
+        phases = [self.phase + offset for offset in PHASE_OFFSET]
+        return [*map(math.cos, phases), *map(math.sin, phases), *self.scaled.tolist()]

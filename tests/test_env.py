@@ -51,8 +51,7 @@ def test_observation_has_the_papers_parts_in_its_order(flat):
         observation, np.cumsum([N_RAYS, 2, 3, 12, 12])
     )
     assert scan.min() >= 0 and scan.max() <= 1
-    offset = flat.goal - flat.position
-    assert goal[0] == pytest.approx(np.linalg.norm(offset))
+    assert goal[0] == pytest.approx(np.linalg.norm(np.subtract(flat.goal, flat.position)))
     np.testing.assert_allclose(rates, 0, atol=1e-6)
     np.testing.assert_allclose(joints, target, atol=1e-6)  # an episode starts in the TG's pose
     np.testing.assert_allclose(s_tg, flat.generator.state(), atol=1e-6)
@@ -152,7 +151,7 @@ def test_zero_action_walks_by_itself():
 
 def test_success_ends_the_episode_at_the_goal(flat):
     flat.reset(seed=0)
-    place(flat, *(flat.goal - flat.origin - [GOAL_RADIUS - 0.1, 0, 0]))
+    place(flat, *(np.array(flat.goal) - flat.origin - [GOAL_RADIUS - 0.1, 0, 0]))
     _, _, terminated, truncated, info = flat.step(np.zeros(17))
     assert terminated and not truncated
     assert info["success"] and not info["fall"] and info["t_cr"] == 1.0

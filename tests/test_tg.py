@@ -124,7 +124,7 @@ def test_parameters_stay_in_their_limits(action):
     generator.step(action, 0.03)
     assert (np.abs(generator.parameters - tg.CENTRE) <= tg.RANGE + 1e-12).all()
     assert np.abs(generator.state()).max() <= 1 + 1e-9
-    assert generator.state().shape == (generator.state_size,)
+    assert len(generator.state()) == generator.state_size
 
 
 def test_phase_advances_by_the_frequency():
