@@ -447,6 +447,62 @@ def rooms(rng, difficulty):
     return h
 
 
+def mazes(rng, difficulty):
+    """Rooms of 1.4-2.2 m in a grid, up to 6 in 10 of the walls between them standing."""
+    pitch = rng.integers(8, 13)  # pillars
+    x, y = np.arange(PAD + 1, SHAPE[0] - PAD, pitch), np.arange(rng.integers(4), SHAPE[1], pitch)
+    h = np.zeros(SHAPE)
+    for i in x:
+        for j in y:
+            tall = _wall(difficulty) * (rng.random(2) < 0.6)
+            h[i : i + pitch + 1, j] = np.maximum(h[i : i + pitch + 1, j], tall[0])
+            h[i, j : j + pitch + 1] = np.maximum(h[i, j : j + pitch + 1], tall[1])
+    h[-PAD:] = 0
+    return h
+
+
+def screens(rng, difficulty):
+    """Up to 20 free-standing walls of 0.8-3 m, along and across the way."""
+    h = np.zeros(SHAPE)
+    for _ in range(round(20 * difficulty)):
+        i, j, long = rng.integers(PAD, SHAPE[0] - PAD), rng.integers(SHAPE[1]), rng.integers(4, 16)
+        wall = np.s_[i, j : j + long] if rng.random() < 0.6 else np.s_[i : i + long, j]
+        h[wall] = _wall(difficulty)
+    return h
+
+
+def traps(rng, difficulty):
+    """Up to 6 dead ends to walk out of, 1.4-3 m wide and 0.6-1.6 m deep, open to either end."""
+    h = np.zeros(SHAPE)
+    for _ in range(round(6 * difficulty)):
+        i, j = rng.integers(PAD + 1, SHAPE[0] - PAD - 1), rng.integers(1, SHAPE[1] - 8)
+        wide, deep = rng.integers(7, 16), rng.choice([-1, 1]) * rng.integers(3, 9)
+        a, b = sorted((i, int(np.clip(i + deep, PAD, SHAPE[0] - PAD))))
+        h[i, j : j + wide] = h[a : b + 1, [j, min(j + wide, SHAPE[1]) - 1]] = _wall(difficulty)
+    return h
+
+
+def pits(rng, difficulty):
+    """Up to 14 pits of 0.6-2.4 m a side and up to 1 m deep, to walk around."""
+    return -_boxes(rng, 14 * difficulty, (3, 12), (0.5 * difficulty, difficulty))
+
+
+def coasts(rng, difficulty):
+    """A winding edge along the way, a drop of up to 1 m on one side of it."""
+    turn, phase, swing = rng.uniform(0.5, 1), rng.uniform(0, 6.3), rng.uniform(0.8, 2)
+    edge, side = rng.uniform(-1, 1) + swing * np.sin(turn * X + phase), rng.choice([-1, 1])
+    return np.where((side * Y > edge) & (U > 0) & (U < SPAN), -1.0 * difficulty, 0.0)
+
+
+def crags(rng, difficulty):
+    """Hills 4 m long with slopes to about 27 degrees, bumps of 4 cm and up to 25 boulders."""
+    hills = _noise(rng, SHAPE, (4, 3))
+    slope = np.percentile(np.hypot(*np.gradient(hills, L)), 90)
+    ground = hills * np.tan(np.radians(27 * difficulty)) / slope * _taper(2.5)
+    bumps = rng.uniform(0, 0.04 * difficulty, SHAPE)
+    return ground + bumps + _boxes(rng, 25 * difficulty, (1, 3), (0.05, 0.4))
+
+
 def blocks(rng, difficulty):
     """Up to 60 low boxes and steps of 0.03-0.12 m to tread on, and 15 tall ones to avoid."""
     low = _boxes(rng, 60 * difficulty, (2, 6), (0.03, 0.12))
@@ -476,8 +532,8 @@ PILLAR_TASKS = {
     task.__name__: task
     for task in (
         flat, rugged, holes, obstacles, stairs, stones, slopes, side_slope, pyramids_up,
-        pyramids_down, gaps, hurdles, ridges, corridors, walls, rooms, blocks, poles, waves,
-        fractal,
+        pyramids_down, gaps, hurdles, ridges, pits, coasts, corridors, walls, rooms, mazes,
+        screens, traps, blocks, poles, waves, fractal, crags,
     )
 }  # fmt: skip
 
@@ -506,7 +562,8 @@ def make_terrain(task, rng, difficulty):
             strip[:] = np.median(strip)
         ground = Ground(heights, (L, W))
         length = ground.size[0]
-        zones = (1.0, PAD * L), (length - PAD * L, length - 1.0)
+        # From either end, and from wherever else a robot can stand: in a maze, on a ridge.
+        zones = (1.0, PAD * L), (length - PAD * L, length - 1.0), (0.0, length)
         routes = _routes(ground, rng, ROUTES, (min(6, length / 2), 9), zones=zones, margin=1.0)
         if routes:
             mesh = fuse_pillars(heights, L, W)
