@@ -136,9 +136,10 @@ SMOOTHING = 0.5  # share of a new action that takes effect at once; the rest wou
 RESIDUAL = {True: 0.25, False: 0.6}  # rad, largest u_fb with the TG, and without
 GOAL_RADIUS = 0.5  # m, r_g
 BASE_HEIGHT = 0.38  # m, of the walking base: a goal floats that high over the ground
+EXPLODED = 1e3  # m or rad/s
 FALL_UP, FALL_SPEED = 0.5, 2.5  # fallen: tipped by over 60 degrees, or dropping faster (m/s)
 MAX_EPISODE_STEPS = 600  # 20 s
-PICTURE = (480, 360)  # pixels
+PICTURE = (400, 300)  # pixels
 HOT = ("setJointMotorControlArray", "stepSimulation", "getBasePositionAndOrientation",
        "getBaseVelocity", "getMatrixFromQuaternion", "getJointStates", "rayTestBatch")  # fmt: skip
 STATIC_GROUP = 2  # Bullet's collision group of all that does not move by itself: rays see only it
@@ -177,8 +178,9 @@ class LocoEnv(gymnasium.Env):
     It terminates at the goal (base within 0.5 m) and in a fall (base tipped by over 60 degrees or
     dropping faster than 2.5 m/s: both break a real robot). The time limit is the wrapper's.
 
-    `info` holds task, t_cr = 1 - d_T / d_0 in [0, 1] (1 at the goal), success, fall, and
-    collisions: how often the robot has bumped into a person.
+    `info` holds task, t_cr = 1 - d_T / d_0 in [0, 1] (1 at the goal), success, fall, collisions:
+    how often the robot has bumped into a person, and exploded: that the simulation broke down,
+    which ends the episode as a fall with an observation of zeros.
 
     Args:
         tasks: a task's name, a function (rng, difficulty) -> heights, a finished Terrain, or a list
@@ -321,7 +323,8 @@ class LocoEnv(gymnasium.Env):
         p.resetBaseVelocity(self.robot, [0, 0, 0], [0, 0, 0])
         for joint, angle in zip(self.joints, self.target, strict=True):
             p.resetJointState(self.robot, joint, angle)
-        self.time, self.collisions, self.touching = 0.0, 0, False
+        self.time, self.collisions = 0.0, 0
+        self.touching = self.exploded = False
         self._move_people()
         observation = self._observe()
         self.start_distance = self.distance
@@ -358,6 +361,11 @@ class LocoEnv(gymnasium.Env):
 
         before = self.distance
         observation = self._observe()
+        if not math.hypot(self.distance, *self.rates) < EXPLODED:  # not: NaN compares to nothing
+            p.removeBody(self.robot)
+            self._load_robot()
+            self.distance, self.exploded = before, True
+            return np.zeros_like(observation), 0.0, True, False, self._info(False, True)
         success = self.distance < GOAL_RADIUS
         fall = self.up < FALL_UP or self.velocity[2] < -FALL_SPEED
         reward = (before - self.distance) / DT
@@ -371,6 +379,7 @@ class LocoEnv(gymnasium.Env):
             "success": success,
             "fall": fall and not success,
             "collisions": self.collisions,
+            "exploded": self.exploded,
         }
 
     def _move_people(self):
@@ -384,14 +393,15 @@ class LocoEnv(gymnasium.Env):
     def _observe(self):
         p = self.bullet
         position, quaternion = p.getBasePositionAndOrientation(self.robot)
-        self.velocity, rates = p.getBaseVelocity(self.robot)
+        self.velocity, self.rates = p.getBaseVelocity(self.robot)
         r = p.getMatrixFromQuaternion(quaternion)
         self.position, self.up = position, r[8]
         self.distance = math.dist(self.goal, position)
         heading = math.atan2(self.goal[1] - position[1], self.goal[0] - position[0])
         heading -= math.atan2(r[3], r[0])
         state = [self.distance, (heading + math.pi) % (2 * math.pi) - math.pi]
-        state += [r[i] * rates[0] + r[3 + i] * rates[1] + r[6 + i] * rates[2] for i in range(3)]
+        wx, wy, wz = self.rates
+        state += [r[i] * wx + r[3 + i] * wy + r[6 + i] * wz for i in range(3)]
         state += [joint[0] for joint in p.getJointStates(self.robot, self.joints)]
         state += self.target.tolist()
         if self.generator:
@@ -408,9 +418,9 @@ class LocoEnv(gymnasium.Env):
         return np.array(scan + state, dtype=np.float32)
 
     def render(self):
-        """The robot from above and behind, as uint8 (360, 480, 3)."""
+        """The robot from above and behind, as uint8 (300, 400, 3)."""
         p, (width, height) = self.bullet, PICTURE
-        view = p.computeViewMatrixFromYawPitchRoll(self.position, 2.4, self.view_yaw, -42, 0, 2)
+        view = p.computeViewMatrixFromYawPitchRoll(self.position, 2.4, self.view_yaw, -52, 0, 2)
         projection = p.computeProjectionMatrixFOV(55, width / height, 0.1, 40)
         rgba = p.getCameraImage(
             width, height, view, projection, renderer=p.ER_TINY_RENDERER,
@@ -508,7 +518,7 @@ def train(args):
             )
             make_env = functools.partial(training_env, seed=args.seed, tasks=tasks, **options)
             learn(make_env, config, run_dir=run_dir, resume=resume, mirror=mirror, meta=meta,
-                  groups=args.tasks)  # fmt: skip
+                  episode_keys=("t_cr", "success", "fall", "exploded"), groups=args.tasks)
             resume = True
     except KeyboardInterrupt:
         if int(os.environ.get("RANK", 0)) == 0:
@@ -552,7 +562,7 @@ def _commit():
 # ------------------------------------------------------------------------------- eval
 
 EVAL_SECONDS = 60  # an episode's limit: 36 m at 0.6 m/s, three times the farthest goal
-GIF_EVERY = 3  # control steps a frame: 10 frames a second
+GIF_EVERY = 4  # control steps a frame: 7.5 frames a second
 EVAL_SEED = 10_000  # episode k of every policy in every world has seed EVAL_SEED + k
 # Tables 1 and 2, t_cr in the order of WORLDS: means, then standard deviations, in hundredths.
 PAPER = {
@@ -752,7 +762,8 @@ def play(args):
     if not args.gui:
         from PIL import Image
 
-        pictures = [Image.fromarray(frame).quantize(48) for frame in frames]
+        palette = Image.fromarray(np.concatenate(frames[:: len(frames) // 8 + 1])).quantize(64)
+        pictures = [Image.fromarray(frame).quantize(palette=palette, dither=0) for frame in frames]
         pictures[0].save(args.gif, save_all=True, append_images=pictures[1:], loop=0,
                          duration=round(1000 * GIF_EVERY * DT))  # fmt: skip
         figure = _figure(figsize=(6, 5))

@@ -179,6 +179,20 @@ def test_dropping_off_an_edge_is_a_fall():
     env.close()
 
 
+@pytest.mark.parametrize("speed", [np.nan, np.inf])
+def test_an_exploding_robot_ends_the_episode_and_poisons_nothing(flat, speed):
+    flat.reset(seed=0)
+    flat.bullet.resetBaseVelocity(flat.robot, (0, 0, 0), (speed, 0, 0))
+    observation, reward, terminated, _, info = flat.step(np.zeros(17))
+    assert terminated and info["fall"] and info["exploded"]
+    assert reward == 0 and observation in flat.observation_space
+    assert 0 <= info["t_cr"] <= 1
+    flat.reset()
+    for _ in range(30):
+        observation, reward, terminated, _, info = flat.step(np.zeros(17))
+        assert not terminated and np.isfinite(observation).all() and not info["exploded"]
+
+
 def test_time_limit_truncates():
     env = gymnasium.make("LocoMTRL-v0", tasks="flat", max_episode_steps=7)
     env.reset(seed=0)
@@ -208,6 +222,17 @@ def test_same_seed_same_observations():
         np.testing.assert_array_equal(first, episode(other, seed))  # in another one
     assert not np.array_equal(first, episode(one, seed=6))
     one.close(), other.close()
+
+
+def test_tasks_share_the_steps_not_the_episodes():
+    env = LocoEnv(["flat", "rugged", wall_ahead])
+    env.reset(seed=0)
+    for step in range(300):
+        env.step(np.zeros(17))
+        if step % (10 if env.terrain.name == "rugged" else 50) == 0:  # as if it fell
+            env.reset()
+    assert env.spent.sum() == 300 and env.spent.max() - env.spent.min() <= 60
+    env.close()
 
 
 def test_every_task_is_drawn_and_named():
