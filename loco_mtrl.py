@@ -865,14 +865,14 @@ def parse(argv):
     p.add_argument("--seed", type=int, default=0)
     p.set_defaults(run=gallery)
 
-    args = parser.parse_args(argv or ["train"])
-    args.argv = list(argv)
+    args = parser.parse_args(argv)
+    args.argv = argv
     return args
 
 
 def main(argv=None):
     argv = sys.argv[1:] if argv is None else argv
-    args = parse(argv)
+    args = parse(argv or ["train"])
     try:
         code = args.run(args)
         if not argv and not code:  # the main job: train, then score

@@ -39,7 +39,7 @@ class PPOConfig:
     num_steps: int = 160  # steps per environment between two updates
     gamma: float = 0.99  # discount per step
     gae_lambda: float = 0.95  # 0: one-step TD, little variance; 1: Monte Carlo, no bias
-    update_epochs: int = 5  # passes over each rollout
+    update_epochs: int = 4  # passes over each rollout
     num_minibatches: int = 4  # gradient steps per pass
     clip_coef: float = 0.2  # a probability ratio earns nothing outside 1 +- clip_coef
     max_grad_norm: float = 1.0  # for the actor and the critic, each on its own
