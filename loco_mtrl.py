@@ -325,6 +325,8 @@ class LocoEnv(gymnasium.Env):
             p.resetJointState(self.robot, joint, angle)
         self.time, self.collisions = 0.0, 0
         self.touching = self.exploded = False
+        for body in self.people:  # not all terrains have as many
+            p.resetBasePositionAndOrientation(body, (0, 0, -1000), (0, 0, 0, 1))
         self._move_people()
         observation = self._observe()
         self.start_distance = self.distance

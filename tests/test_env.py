@@ -1,5 +1,7 @@
 """The environment: its senses against geometry, its reward and endings against the paper."""
 
+import dataclasses
+
 import gymnasium
 import numpy as np
 import pytest
@@ -102,6 +104,39 @@ def test_lidar_sees_a_wall_at_its_distance():
     compared = inside | ~np.isfinite(to_wall)
     np.testing.assert_allclose(scan[compared], expected[compared] / LIDAR_RANGE, atol=2e-4)
     assert (expected[compared] == to_wall[compared]).sum() > 30
+    env.close()
+
+
+def with_person(x0, x1, speed):
+    """Flat ground on which a person walks to and fro along x."""
+    ground = terrain.make_terrain("flat", np.random.default_rng(0), 0.0)
+    person = terrain.Person(np.array([[x0, 0.0], [x1, 0.0]]), speed)
+    return LocoEnv(dataclasses.replace(ground, people=(person,)))
+
+
+def test_lidar_sees_a_person_where_he_is_and_as_he_moves():
+    env = with_person(7.0, 5.0, speed=1.0)
+    env.reset(seed=0)
+    row, column = loco_mtrl.LIDAR_ELEVATIONS.index(-3), 7  # the ray 5.67 degrees to the left
+    yaw = -np.radians(loco_mtrl.LIDAR_AZIMUTHS[column])
+    sensor = 3.6 + LIDAR_POSITION[0] * np.cos(yaw), LIDAR_POSITION[0] * np.sin(yaw)
+    for seconds in (0.0, 0.5, 1.0, 2.5):
+        env.time = seconds
+        env._move_people()
+        scan = place(env, 3.6, 0.0, 0.4, yaw)[:N_RAYS].reshape(-1, len(loco_mtrl.LIDAR_AZIMUTHS))
+        centre = 7.0 - seconds if seconds <= 2 else 5.0 + (seconds - 2)
+        along = centre - sensor[0] - np.sqrt(terrain.PERSON_RADIUS**2 - sensor[1] ** 2)
+        expected = min(along / np.cos(np.radians(3)) / LIDAR_RANGE, 1.0)
+        assert scan[row, column] == pytest.approx(expected, abs=2e-3)
+    env.close()
+
+
+def test_a_person_can_be_bumped_into():
+    env = with_person(6.0, 3.0, speed=1.2)
+    env.reset(seed=0)
+    place(env, 4.0, 0.0, 0.4)
+    hits = [env.step(np.zeros(17))[4]["collisions"] for _ in range(60)]
+    assert hits[0] == 0 and hits[-1] >= 1 and hits == sorted(hits)
     env.close()
 
 
