@@ -524,8 +524,7 @@ def train(args):
             resume = True
     except KeyboardInterrupt:
         if int(os.environ.get("RANK", 0)) == 0:
-            again = [a for a in args.argv if a != "--resume"] + ["--resume"]
-            print(f"\nStopped and saved. To go on: python loco_mtrl.py {' '.join(again)}")
+            print(f"\nStopped and saved. To go on: {_again(args)}")
         return 130
     if int(os.environ.get("RANK", 0)) == 0:
         checkpoint = load_checkpoint(run_dir / "checkpoint.pt")
@@ -548,8 +547,18 @@ def launch(args):
     except SignalException as signal:
         return 128 + signal.sigval
     except ChildFailedError as error:
-        return error.get_first_failure()[1].exitcode  # the rank itself has said what is wrong
+        rank, failure = error.get_first_failure()
+        if failure.exitcode > 0:
+            return failure.exitcode  # the rank itself has said what is wrong
+        print(f"loco_mtrl.py: error: rank {rank} was killed by signal {-failure.exitcode}. "
+              f"To go on from the last checkpoint: {_again(args)}", file=sys.stderr)  # fmt: skip
+        return 1
     return 0
+
+
+def _again(args):
+    """The command that resumes this run."""
+    return " ".join(["python loco_mtrl.py", *(a for a in args.argv if a != "--resume"), "--resume"])
 
 
 def _commit():

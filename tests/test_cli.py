@@ -4,11 +4,13 @@ import csv
 import json
 import os
 import pickle
+import signal
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 import torch
 
@@ -51,6 +53,36 @@ def test_training_leaves_what_a_person_needs(trained):
     config = json.loads((trained / "config.json").read_text())
     assert config["meta"]["tasks"] == ["flat"] and config["ppo"]["seed"] == 0
     assert (trained / "policy.pt").stat().st_size < 1e6
+
+
+def test_ctrl_c_saves_and_a_killed_rank_stops_all(tmp_path):
+    command = ["train", "--tasks", "flat", "--ranks", 2, "--run-dir", tmp_path / "b"]
+
+    def stop_after_two_updates(*more, stop):
+        process = subprocess.Popen(
+            [sys.executable, str(ROOT / "loco_mtrl.py"), *map(str, [*command, *more])],
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True,
+        )  # fmt: skip
+        bars = ""
+        while bars.count("t_cr") < 2:  # the bar names it after every update
+            bars += process.stdout.read(20) or pytest.fail(bars)
+        stop(process)
+        text, _ = process.communicate(timeout=100)
+        return process.returncode, text.splitlines()
+
+    interrupt = lambda process: os.killpg(process.pid, signal.SIGINT)  # noqa: E731
+    code, lines = stop_after_two_updates(stop=interrupt)
+    assert code == 130 and any("To go on: python loco_mtrl.py train" in line for line in lines)
+    saved = progress(tmp_path / "b")
+
+    def kill_a_rank(process):
+        ranks = psutil.Process(process.pid).children()
+        ranks[-1].kill()
+
+    code, lines = stop_after_two_updates("--resume", stop=kill_a_rank)
+    assert code == 1 and "killed by signal 9" in lines[-1] and "--resume" in lines[-1]
+    ppo.load_policy(tmp_path / "b" / "checkpoint.pt")
+    assert progress(tmp_path / "b")[: len(saved)] == saved  # continued, nothing lost
 
 
 def test_resume_goes_on(trained):
