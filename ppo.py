@@ -558,9 +558,13 @@ def learn(make_env, config, *, run_dir=None, resume=False, mirror=None, init=Non
             bar.set_postfix({k: f"{row[k]:.3g}" for k in means[:2] if row[k] == row[k]})
             if run_dir is not None and rank == 0:
                 progress = Path(run_dir) / "progress.csv"
-                header = "" if progress.exists() else ",".join(row) + "\n"
-                with open(progress, "a") as file:
-                    file.write(header + ",".join(f"{x:.10g}" for x in row.values()) + "\n")
+                header = ",".join(row) + "\n"
+                with open(progress, "a+") as file:
+                    file.seek(0)
+                    if (first_line := file.readline()) not in ("", header):
+                        raise ValueError(f"{progress} has other columns: resume it as it was")
+                    file.write("" if first_line else header)
+                    file.write(",".join(f"{x:.10g}" for x in row.values()) + "\n")
                 finished = stopped or steps >= config.total_timesteps
                 if finished or update % config.checkpoint_every == 0:
                     counters = {"update": update, "steps": steps, "minutes": minutes}

@@ -459,6 +459,9 @@ def test_resuming_needs_a_checkpoint_and_an_env_that_fits(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"checkpoint\.pt"):
         run(tmp_path, 1, resume=True)
     run(tmp_path, 1)
+    config = PPOConfig(total_timesteps=10_000, **SMALL)
+    with pytest.raises(ValueError, match="other columns"):
+        learn(lambda index: Probe(), config, run_dir=tmp_path, resume=True)
     with pytest.raises(ValueError, match="obs_dim = 2, but the env has 6"):
         learn(lambda index: Square(), PPOConfig(**SMALL), run_dir=tmp_path, resume=True)
 
