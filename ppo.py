@@ -448,6 +448,8 @@ def learn(make_env, config, *, run_dir=None, resume=False, mirror=None, init=Non
     checkpoint = opened[0]
     if isinstance(checkpoint, Exception):
         raise checkpoint
+    if checkpoint and checkpoint["counters"]["steps"] >= config.total_timesteps:
+        return build_policy(checkpoint)  # nothing left to learn
 
     num_steps, num_envs = config.num_steps, config.num_envs
     first = rank * num_envs
