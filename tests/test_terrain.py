@@ -1,0 +1,373 @@
+"""Tasks and worlds: what they are, that they can be walked, and that the mesh is the ground."""
+
+from collections import deque
+from pathlib import Path
+
+import numpy as np
+import pybullet
+import pybullet_data
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import array_shapes, arrays
+
+import terrain
+from terrain import PILLAR_TASKS, WORLDS, L, W, fuse_pillars, load_mesh, make_terrain, make_world
+
+DATA = Path(pybullet_data.getDataPath())
+NO_CLIMBING = ("maze", "office1", "office2", "dynamic", "forest")
+
+
+@pytest.fixture
+def client():
+    client = pybullet.connect(pybullet.DIRECT)
+    yield client
+    pybullet.disconnect(client)
+
+
+def add_mesh(client, vertices, triangles):
+    shape = pybullet.createCollisionShape(
+        pybullet.GEOM_MESH, vertices=vertices.tolist(), indices=triangles.ravel().tolist(),
+        flags=pybullet.GEOM_FORCE_CONCAVE_TRIMESH, physicsClientId=client,
+    )  # fmt: skip
+    return pybullet.createMultiBody(0, shape, physicsClientId=client)
+
+
+def heights_by_rays(client, vertices, triangles, x, y):
+    """Where rays straight down meet a mesh in Bullet: (N,) z, or NaN."""
+    body = add_mesh(client, vertices, triangles)
+    top = vertices[:, 2].max() + 1
+    bottom = vertices[:, 2].min() - 1
+    z = []
+    for k in range(0, len(x), 1000):
+        ends = [np.c_[x, y, np.full(len(x), h)][k : k + 1000].tolist() for h in (top, bottom)]
+        hits = pybullet.rayTestBatch(*ends, physicsClientId=client)
+        z += [hit[3][2] if hit[0] >= 0 else np.nan for hit in hits]
+    pybullet.removeBody(body, physicsClientId=client)
+    return np.array(z)
+
+
+def oracle(ground, climb, start, goal, cell=0.1, radius=0.25):
+    """Whether a disc can roll from start to goal: plain breadth-first search over `cell`s.
+
+    Holes up to 0.2 m across are stepped over: a low cell between two high ones counts as high.
+    """
+    length, width = ground.size
+    x, y = np.arange(cell / 2, length, cell), np.arange(-width / 2 + cell / 2, width / 2, cell)
+    z = np.maximum(ground(*np.meshgrid(x, y, indexing="ij")), -1e3)
+    for axis in (0, 1):
+        z = np.moveaxis(z, axis, 0)
+        bridged = z.copy()
+        for gap in (1, 2):
+            for k in range(1, len(z) - gap):
+                level = np.minimum(z[k - 1], z[k + gap])
+                bridged[k : k + gap] = np.maximum(bridged[k : k + gap], level)
+        z = np.moveaxis(bridged, 0, axis)
+    bad = np.zeros(z.shape, bool)
+    rise = np.abs(np.diff(z, axis=0)) > climb + 1e-6
+    bad[1:] |= rise
+    rise = np.abs(np.diff(z, axis=1)) > climb + 1e-6
+    bad[:, 1:] |= rise
+    # A disc that touches the middle of a bad cell's face cannot be there.
+    reach = int(np.ceil(radius / cell)) - 1
+    blocked = bad.copy()
+    for i, j in zip(*np.nonzero(bad), strict=True):
+        blocked[max(i - reach, 0) : i + reach, max(j - reach, 0) : j + reach] = True
+    cells = [tuple(np.argmin(np.abs(a - p)) for a, p in zip((x, y), q[:2], strict=True))
+             for q in (start, goal)]  # fmt: skip
+    queue, seen = deque([cells[0]]), {cells[0]}
+    while queue:
+        i, j = queue.popleft()
+        if (i, j) == cells[1]:
+            return True
+        for near in ((i + 1, j), (i - 1, j), (i, j + 1), (i, j - 1)):
+            inside = 0 <= near[0] < len(x) and 0 <= near[1] < len(y)
+            if inside and near not in seen and not blocked[near]:
+                seen.add(near)
+                queue.append(near)
+    return False
+
+
+def standable(ground, start, tall):
+    """A robot of any yaw fits: nothing above `tall` m within 0.45 m, the middle is level."""
+    x, y, z, _ = start
+    u, v = np.mgrid[-0.45:0.46:0.03, -0.45:0.46:0.03]
+    disc = np.hypot(u, v) <= 0.45
+    around = ground(x + u[disc], y + v[disc])
+    return around.max() - z <= tall and z - around.min() <= tall
+
+
+# ---------------------------------------------------------------- meshes
+
+
+def test_fused_mesh_of_two_by_two_pillars_by_hand():
+    heights = np.array([[0.0, 1.0], [1.0, 1.0]])
+    vertices, triangles = fuse_pillars(heights, 0.5, 0.25)
+    # Tops: (0, 0) alone, (0, 1) alone, the row (1, 0)-(1, 1) as one. Walls: between (0, 0) and each
+    # of its two neighbours. Five quads of four corners and two triangles each.
+    assert vertices.shape == (20, 3) and triangles.shape == (10, 3)
+    a, b, c = (vertices[triangles[:, k]] for k in range(3))
+    normal = np.cross(b - a, c - a)
+    tops, walls = normal[:6], normal[6:]
+    assert (tops[:, 2] > 0).all() and (tops[:, :2] == 0).all()
+    assert (walls[:, 2] == 0).all() and (walls[:, :2].min(1) < 0).all()  # they face (0, 0)
+    assert tops[:, 2].sum() / 2 == pytest.approx(1.0 * 0.5)  # the whole area, once
+    assert vertices.min(0) == pytest.approx([0, -0.25, 0])
+    assert vertices.max(0) == pytest.approx([1, 0.25, 1])
+
+
+def test_equal_pillars_fuse_into_one_rectangle():
+    vertices, triangles = fuse_pillars(np.full((60, 40), 0.3), L, W)
+    assert len(triangles) == 2 and np.ptp(vertices[:, 0]) == 60 * L
+
+
+@settings(max_examples=25, deadline=None)
+@given(arrays(np.float64, array_shapes(min_dims=2, max_dims=2, max_side=12),
+              elements=st.sampled_from([-1.0, 0.0, 0.05, 0.5, 2.0])), st.integers(0, 99))
+def test_a_ray_down_meets_the_pillars_height(heights, seed):
+    client = pybullet.connect(pybullet.DIRECT)
+    mesh = fuse_pillars(heights, L, W)
+    rng = np.random.default_rng(seed)
+    i, j = (rng.integers(n, size=50) for n in heights.shape)
+    x, y = (i + rng.uniform(0.05, 0.95, 50)) * L, (j + rng.uniform(0.05, 0.95, 50)) * W
+    y -= heights.shape[1] * W / 2
+    np.testing.assert_allclose(heights_by_rays(client, *mesh, x, y), heights[i, j], atol=1e-4)
+    np.testing.assert_array_equal(terrain.Ground(heights, (L, W))(x, y), heights[i, j])
+    pybullet.disconnect(client)
+
+
+def test_smooth_ground_is_its_triangles(client):
+    nodes = np.random.default_rng(0).uniform(-0.5, 0.5, (9, 7))
+    x, y = np.random.default_rng(1).uniform([0, -0.9], [2.4, 0.9], (300, 2)).T
+    rays = heights_by_rays(client, *terrain.triangulate(nodes, (0.3, 0.3)), x, y)
+    ground = terrain.Ground(nodes, (0.3, 0.3), smooth=True)
+    np.testing.assert_allclose(ground(x, y), rays, atol=1e-4)
+
+
+@pytest.mark.parametrize("heights", [np.zeros(3), np.zeros((2, 2, 2)), np.zeros((0, 4)),
+                                     [[0.0, np.nan]], [[np.inf]]])  # fmt: skip
+def test_bad_heights_are_named(heights):
+    with pytest.raises(ValueError, match="finite 2-D"):
+        fuse_pillars(heights, L, W)
+
+
+@pytest.mark.parametrize("size", [0.0, -1.0, np.nan, np.inf])
+def test_bad_pillar_sizes_are_named(size):
+    with pytest.raises(ValueError, match="positive"):
+        fuse_pillars(np.zeros((2, 2)), L, size)
+
+
+# ---------------------------------------------------------------- tasks
+
+
+@pytest.mark.parametrize("difficulty", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize("task", PILLAR_TASKS)
+def test_tasks_can_be_stood_on_and_walked(task, difficulty):
+    place = make_terrain(task, np.random.default_rng(7), difficulty)
+    assert np.isfinite(place.vertices).all() and place.triangles.max() < len(place.vertices)
+    assert len(place.triangles) < 16_000 and place.starts.shape == (8, 4)
+    for start, goal in zip(place.starts, place.goals, strict=True):
+        assert 6 <= np.hypot(*(goal - start[:3])[:2]) <= 9
+        assert standable(place.height, start, 0.1)
+        assert start[3] == pytest.approx(np.arctan2(*(goal - start[:3])[1::-1]))
+        assert start[2] == place.height(*start[:2]) and goal[2] == place.height(*goal[:2])
+    assert oracle(place.height, terrain.CLIMB, place.starts[0], place.goals[0])
+
+
+@pytest.mark.parametrize("task", PILLAR_TASKS)
+def test_difficulty_zero_is_flat_and_one_is_not(task):
+    assert np.ptp(PILLAR_TASKS[task](np.random.default_rng(0), 0.0)) < 0.01
+    hard = [np.ptp(PILLAR_TASKS[task](np.random.default_rng(s), 1.0)) for s in range(5)]
+    assert min(hard) >= 0.1 or task == "flat"
+
+
+def test_the_same_generator_gives_the_same_terrain():
+    for task in ("rugged", "mazes", "crags"):
+        one, two = (make_terrain(task, np.random.default_rng(3), 0.7) for _ in range(2))
+        other = make_terrain(task, np.random.default_rng(4), 0.7)
+        np.testing.assert_array_equal(one.vertices, two.vertices)
+        np.testing.assert_array_equal(one.goals, two.goals)
+        assert one.vertices.shape != other.vertices.shape or (one.vertices != other.vertices).any()
+
+
+def test_a_function_of_another_size_is_a_task():
+    def ditch(rng, difficulty):
+        heights = np.zeros((80, 30))
+        heights[40] = -difficulty
+        return heights
+
+    place = make_terrain(ditch, np.random.default_rng(0), 0.5)
+    assert place.name == "ditch" and place.height(40.5 * L, 0.0) == -0.5
+    assert make_terrain(place, None, None) is place
+
+
+def test_path_lengths_go_around():
+    def wall(rng, difficulty):
+        heights = np.zeros((60, 40))
+        heights[30, :30] = 1.0
+        return heights
+
+    place = make_terrain(wall, np.random.default_rng(0), 1.0)
+    k = next(k for k in range(8) if (place.starts[k, 0] < 6) != (place.goals[k, 0] < 6))
+    (x, y), goal = (5.5, -2.0), place.goals[k]
+    behind = place.path_length(k, 6.7, -2.0)
+    if goal[0] > 6:
+        assert place.path_length(k, x, y) > behind + 4  # the wall's end is 4 m away
+    assert place.path_length(k, *goal[:2]) < 0.2
+    assert np.isfinite(place.paths).all()
+    outside = [place.path_length(k, *p) for p in ((-5, 0), (99, 99), (6, -40))]
+    assert np.isfinite(outside).all()
+
+
+@pytest.mark.parametrize("task, difficulty, named", [
+    ("lava", 0.5, "lava.*flat.*crags"), ("flat", 2, "2"), ("flat", -0.1, "-0.1"),
+    ("flat", np.nan, "nan"), (lambda rng, d: np.zeros(5), 0.5, "2-D"),
+    (lambda rng, d: np.full((60, 40), np.nan), 0.5, "finite"),
+    (lambda rng, d: np.indices((60, 20)).sum(0) % 2 * 9.0, 0.5, "route"), (None, 0.5, "None"),
+])  # fmt: skip
+def test_bad_tasks_are_named(task, difficulty, named):
+    with pytest.raises(ValueError, match=named):
+        make_terrain(task, np.random.default_rng(0), difficulty)
+
+
+# ---------------------------------------------------------------- worlds
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("name", WORLDS)
+def test_worlds_can_be_stood_on_and_walked(name, seed):
+    world = make_world(name, seed)
+    assert len(world.triangles) < 20_000
+    (start,), (goal,) = world.starts, world.goals
+    assert 6 <= np.hypot(*(goal - start[:3])[:2]) <= 12
+    assert standable(world.height, start, 0.1)
+    climb = terrain.LEVEL if name in NO_CLIMBING else terrain.CLIMB
+    assert oracle(world.height, climb, start, goal)
+    again, other = make_world(name, seed), make_world(name, seed + 100)
+    np.testing.assert_array_equal(world.vertices, again.vertices)
+    assert not np.array_equal(world.goals, other.goals)
+
+
+@pytest.mark.parametrize("name", WORLDS)
+def test_the_height_of_a_world_is_its_mesh(name, client):
+    world = make_world(name, 1)
+    length, width = world.height.size
+    x, y = np.random.default_rng(0).uniform([0, -width / 2], [length, width / 2], (3000, 2)).T
+    error = np.abs(heights_by_rays(client, world.vertices, world.triangles, x, y)
+                   - world.height(x, y))  # fmt: skip
+    # Round trunks and rocks, and chairs below their backs, are only near to their 0.1 m cells.
+    assert np.mean(error < 0.06) > 0.95
+
+
+def test_walls_of_the_maze_and_its_corridors():
+    heights = make_world("maze", 0).height.heights
+    assert set(np.unique(heights)) == {0.0, 1.3}
+    assert (heights[::13, ::13] == 1.3).all() and (heights[6::13, 6::13] == 0).all()  # 1.2 m wide
+
+
+def test_slopes_of_mountain_and_continuous():
+    for name, least, most in (("mountain", 24, 34), ("continuous", 16, 24)):
+        steep = []
+        for seed in range(4):
+            world = make_world(name, seed)
+            a, b, c = (world.vertices[world.triangles[:, k]] for k in range(3))
+            normal = np.cross(b - a, c - a)
+            surface = normal[:, 2] > 0.3 * np.linalg.norm(normal, axis=1)  # not a rock's side
+            cosine = normal[surface, 2] / np.linalg.norm(normal[surface], axis=1)
+            steep.append(np.degrees(np.arccos(np.percentile(cosine, 5))))
+        assert least <= np.mean(steep) <= most
+
+
+def test_the_cliffs_path_is_narrow_and_the_drop_deep():
+    for seed in range(4):
+        plan = make_world("cliff", seed).height.heights
+        path = plan > -0.5
+        assert plan[~path].max() <= -1.0
+        width = path[30:100].sum(1) * terrain.FINE  # along y: a winding path looks wider
+        assert 0.9 <= width.min() and np.median(width) <= 2.2
+
+
+def test_doorways_of_the_offices():
+    for seed in range(4):
+        heights = make_world("office1", seed).height.heights
+        for wall in (40, 57):  # of the corridor
+            row = "".join("#" if h == terrain.CLOSED else "." for h in heights[:, wall])
+            doors = [len(gap) for gap in row.split("#") if gap]
+            assert len(doors) >= 2 and set(doors) <= {9, 10}  # 0.9-1.0 m
+
+
+def test_people_walk_at_a_humans_speed_and_never_through_walls():
+    for seed in range(3):
+        world = make_world("dynamic", seed)
+        assert len(world.people) >= 4
+        t = np.arange(0, 60, 0.1)
+        for person in world.people:
+            x, y, yaw = np.array([person.position(s) for s in t]).T
+            assert np.hypot(x[0] - world.starts[0, 0], y[0] - world.starts[0, 1]) >= 1.5
+            speed = np.hypot(np.diff(x), np.diff(y)) / 0.1
+            assert 0.5 <= person.speed <= 1.2 and speed.max() <= person.speed + 1e-6
+            assert np.median(speed) > 0.9 * person.speed
+            for angle in np.arange(0, 6.28, 0.4):  # his whole body stands on the free floor
+                body = world.height(x + 0.2 * np.cos(angle), y + 0.2 * np.sin(angle))
+                assert (np.abs(body) < 0.1).all()
+            ahead = np.cos(np.arctan2(np.diff(y), np.diff(x)) - yaw[:-1])
+            assert np.median(ahead) > 0.7  # he looks where he goes
+
+
+@pytest.mark.parametrize("name, seed, named", [
+    ("moon", 0, "moon.*maze.*continuous"), ("maze", -1, "-1"), ("maze", 1.5, "1.5"),
+    ("maze", "x", "'x'"),
+])  # fmt: skip
+def test_bad_worlds_are_named(name, seed, named):
+    with pytest.raises(ValueError, match=named):
+        make_world(name, seed)
+
+
+# ---------------------------------------------------------------- scanned buildings
+
+
+@pytest.mark.parametrize("file, scale, up", [
+    ("samurai_monastry.obj", 1.0, "y"), ("roboschool/models_outdoor/stadium/stadium.obj", 1.0, "z"),
+    ("plane100.obj", 0.2, "z"), ("random_urdfs/970/970.obj", 2.0, "y"),
+])  # fmt: skip
+def test_meshes_that_nobody_made_for_us(file, scale, up, client):
+    place = load_mesh(DATA / file, scale, up)
+    (start,), (goal,) = place.starts, place.goals
+    assert 1 <= np.hypot(*(goal - start[:3])[:2]) <= 12
+    add_mesh(client, place.vertices, place.triangles)
+    for x, y, z in (start[:3], goal):
+        hit = pybullet.rayTest((x, y, z + 0.6), (x, y, z - 0.6), physicsClientId=client)[0]
+        assert hit[0] >= 0 and hit[3][2] == pytest.approx(z, abs=0.02)
+
+
+def test_bad_meshes_are_named(tmp_path):
+    square = "v 0 0 0\nv 9 0 0\nv 9 9 0\nv 0 9 0\n"
+
+    def error(text, *more, name="a.obj"):
+        (tmp_path / name).write_text(text)
+        with pytest.raises(ValueError) as caught:
+            load_mesh(tmp_path / name, *more)
+        assert "\n" not in str(caught.value)
+        return str(caught.value)
+
+    assert load_mesh(_write(tmp_path / "ok.obj", square + "f 1 2 3 4\n")).name == "ok"
+    assert load_mesh(_write(tmp_path / "ok.obj", square + "f -4/1 -3/2/2 -2//3 -1\n")).name == "ok"
+    assert "empty" in error("") and "a.obj" in error("")
+    assert "no faces" in error(square)
+    assert "line 1" in error("v one two three\n")
+    assert "line 5" in error(square + "f a b c\n")
+    assert "not finite" in error("v nan 0 0\n" + square + "f 1 2 3\n")
+    assert "not there" in error(square + "f 1 2 9\n")
+    assert "no floor" in error("v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\nf 1 2 3\n")
+    assert "too large" in error("v 0 0 0\n" * 131_073 + "f 1 2 3\n")
+    assert "too large" in error(square + "f 1 2 3\n" * 174_763)
+    for scale in (0.0, -1.0, np.nan, np.inf):
+        assert "scale" in error(square + "f 1 2 3 4\n", scale)
+    assert "'x'" in error(square + "f 1 2 3 4\n", 1.0, "x")
+    with pytest.raises(FileNotFoundError, match="nothing"):
+        load_mesh(tmp_path / "nothing.obj")
+
+
+def _write(path, text):
+    path.write_text(text)
+    return path
