@@ -172,9 +172,7 @@ class LocoEnv(gymnasium.Env):
 
     ## Reward
     (d_{t-1} - d_t) / dt, the velocity toward the goal, m/s. The paper prints the opposite sign but
-    calls it the velocity toward the target. With reward="straight" d is the straight distance, as
-    in the paper; with "path", the default, the length of the shortest way around walls and drops,
-    which knows no dead ends. The policy sees the straight distance in both.
+    calls it the velocity toward the target.
 
     ## Episode
     It terminates at the goal (base within 0.5 m) and in a fall (base tipped by over 60 degrees or
@@ -189,7 +187,6 @@ class LocoEnv(gymnasium.Env):
             of these; None: all pillar tasks. Each episode draws one; the policy is not told which.
         difficulty: in [0, 1], or (low, high) to draw it from, once for each terrain.
         tg, lidar: the paper's ablations (section 3) leave one of them out.
-        reward: "path" or "straight".
         terrains: how many terrains of each task to build; Bullet never frees a mesh, so the pool
             is built once and episodes draw from it. A finished Terrain counts once.
         pool_seed: seeds the pool; `reset(seed=...)` seeds all else.
@@ -202,10 +199,8 @@ class LocoEnv(gymnasium.Env):
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": round(1 / DT)}
 
-    def __init__(self, tasks=None, difficulty=(0.0, 1.0), tg=True, lidar=True,
-                 reward="path", terrains=1, pool_seed=0, render_mode=None, gui=False):  # fmt: skip
-        if reward not in ("path", "straight"):
-            raise ValueError(f"reward must be 'path' or 'straight', got {reward!r}")
+    def __init__(self, tasks=None, difficulty=(0.0, 1.0), tg=True, lidar=True, terrains=1,
+                 pool_seed=0, render_mode=None, gui=False):  # fmt: skip
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
         low, high = np.broadcast_to(difficulty, 2)
@@ -213,7 +208,7 @@ class LocoEnv(gymnasium.Env):
             raise ValueError(f"difficulty must be in [0, 1] or (low, high), got {difficulty}")
         if terrains < 1:
             raise ValueError(f"terrains must be at least 1, got {terrains}")
-        self.reward, self.render_mode, self.show_lidar = reward, render_mode, False
+        self.render_mode, self.show_lidar = render_mode, False
         tasks = list(PILLAR_TASKS) if tasks is None else tasks
         tasks = tasks if isinstance(tasks, (list, tuple)) else [tasks]
         if not tasks:
@@ -312,7 +307,7 @@ class LocoEnv(gymnasium.Env):
         index = options.get("terrain", rng.choice(least))
         self.index, self.terrain = index, self.pool[index]
         terrain = self.terrain
-        self.route = route = options.get("route", rng.integers(len(terrain.starts)))
+        route = options.get("route", rng.integers(len(terrain.starts)))
         self.origin = np.array([self.offsets[index], 0.0, 0.0])
         x, y, z, yaw = terrain.starts[route]
         self.goal = (terrain.goals[route] + self.origin + [0, 0, BASE_HEIGHT]).tolist()
@@ -334,7 +329,7 @@ class LocoEnv(gymnasium.Env):
             p.resetBasePositionAndOrientation(body, (0, 0, -1000), (0, 0, 0, 1))
         self._move_people()
         observation = self._observe()
-        self.start_distance, self.to_go = self.distance, self._to_go()
+        self.start_distance = self.distance
         if self.visual:
             p.resetBasePositionAndOrientation(self.flag, self.goal, (0, 0, 0, 1))
             dx, dy, _ = np.subtract(self.goal, self.position)
@@ -366,25 +361,17 @@ class LocoEnv(gymnasium.Env):
             self.collisions += self.touching and not before
             self._move_people()
 
-        before = self.distance, self.to_go
+        before = self.distance
         observation = self._observe()
         if not math.hypot(self.distance, *self.rates) < EXPLODED:  # not: NaN compares to nothing
             p.removeBody(self.robot)
             self._load_robot()
-            self.distance, self.exploded = before[0], True
+            self.distance, self.exploded = before, True
             return np.zeros_like(observation), 0.0, True, False, self._info(False, True)
         success = self.distance < GOAL_RADIUS
         fall = self.up < FALL_UP or self.velocity[2] < -FALL_SPEED
-        self.to_go = self._to_go()
-        reward = (before[1] - self.to_go) / DT
+        reward = (before - self.distance) / DT
         return observation, reward, success or fall, False, self._info(success, fall)
-
-    def _to_go(self):
-        """The distance that the reward counts, m."""
-        if self.reward == "straight":
-            return self.distance
-        x, y, _ = self.position
-        return self.terrain.path_length(self.route, x - self.offsets[self.index], y)
 
     def _info(self, success, fall):
         progress = 1.0 if success else 1.0 - self.distance / self.start_distance
@@ -508,7 +495,7 @@ def train(args):
         if args.resume:
             load_checkpoint(run_dir / "checkpoint.pt")  # a bad one is better named by one process
         return launch(args)
-    options = {"tg": args.tg, "lidar": args.lidar, "reward": args.reward}
+    options = {"tg": args.tg, "lidar": args.lidar}
     meta = {
         **options,
         "tasks": args.tasks,
@@ -860,8 +847,6 @@ def parse(argv):
                    help="comma-separated; default: all %(default)s")  # fmt: skip
     p.add_argument("--no-tg", dest="tg", action="store_false", help="reactive policy")
     p.add_argument("--no-lidar", dest="lidar", action="store_false", help="blind policy")
-    p.add_argument("--reward", choices=("path", "straight"), default="path",
-                   help="progress along the shortest way, or straight as in the paper")  # fmt: skip
     p.add_argument("--sequential", action="store_true", help="one task after the other, not mixed")
     p.add_argument("--seed", type=int, default=0)
     p.add_argument("--run-dir", default="runs/main", help="(default %(default)s)")

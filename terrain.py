@@ -20,7 +20,6 @@ L = W = 0.2  # m, cross-section of a training pillar
 SHAPE = (60, 40)  # m x n pillars: 12 m x 8 m
 
 CELL = 0.1  # m, navigation grid; a disc of 0.25 m radius is known on it to half a cell
-PATH_CELL = 2 * CELL  # m, grid of the shortest ways
 CLIMB = 0.12  # m, highest step that Laikago's feet clear with room to spare
 FLAT = 0.05  # m, most that the ground under a start may vary
 PAD = 9  # pillars, depth of the flat strip at both ends where episodes start (1.8 m)
@@ -104,21 +103,8 @@ class Terrain:
     triangles: np.ndarray  # (F, 3) int, counter-clockwise seen from outside
     starts: np.ndarray  # (K, 4) x, y, ground z, yaw
     goals: np.ndarray  # (K, 3) x, y, ground z
-    paths: np.ndarray  # (K, nx, ny) m, shortest way to goal k from the cells of a grid of PATH_CELL
     height: Callable  # height(x, y) -> ground z, arrays or scalars; -inf outside
     people: tuple[Person, ...] = ()
-
-    def path_length(self, route, x, y):
-        """Length (m) of the shortest way from x, y (scalars) to goal `route` around what is tall
-        or deep, interpolated between cells of PATH_CELL."""
-        lengths = self.paths[route]
-        m, n = lengths.shape
-        u = min(max(x / PATH_CELL - 0.5, 0.0), m - 1.001)
-        v = min(max(y / PATH_CELL + n / 2 - 0.5, 0.0), n - 1.001)
-        i, j = int(u), int(v)
-        f, g = u - i, v - j
-        (a, b), (c, d) = lengths[i : i + 2, j : j + 2].tolist()
-        return (1 - f) * ((1 - g) * a + g * b) + f * ((1 - g) * c + g * d)
 
 
 # ---------------------------------------------------------------- meshes
@@ -244,37 +230,6 @@ def _flood(free, start):
     return np.maximum(steps, -1).reshape(free.shape)
 
 
-def _path_lengths(free, goals):
-    """Shortest ways (m) over `free` to each of the goal cells: (K, nx / 2, ny / 2) float32.
-
-    Beside the free cells, close to walls and edges, it is the way to the nearest free one and on.
-    """
-    even = np.pad(free, [(0, size % 2) for size in free.shape])
-    free = even.reshape(even.shape[0] // 2, 2, -1, 2).any((1, 3))
-    lengths = np.full((len(goals), *free.shape), np.inf, np.float32)
-    for k, (i, j) in enumerate(goals):
-        lengths[k, i // 2, j // 2] = 0
-    m, n = free.shape
-
-    def shorten(lengths):
-        wide = np.pad(lengths, ((0, 0), (1, 1), (1, 1)), constant_values=np.inf)
-        steps = [
-            wide[:, i : i + m, j : j + n] + np.float32(PATH_CELL * np.hypot(i - 1, j - 1))
-            for i in range(3)
-            for j in range(3)
-        ]
-        return np.min(steps, axis=0)
-
-    while True:
-        best = np.where(free, shorten(lengths), lengths)
-        if (best == lengths).all():
-            break
-        lengths = best
-    while np.isinf(lengths).any():
-        lengths = np.where(np.isinf(lengths), shorten(lengths), lengths)
-    return lengths
-
-
 def _pick(rng, mask):
     """A random True cell of `mask` as (i, j), or None."""
     cells = np.argwhere(mask)
@@ -283,7 +238,7 @@ def _pick(rng, mask):
 
 def _routes(ground, rng, count, reach, climb=CLIMB, zones=((0, np.inf),), margin=0.5,
             floor=-np.inf):  # fmt: skip
-    """`count` starts (K, 4) and goals (K, 3) that a walk connects, and the ways to them, or None.
+    """`count` starts (K, 4) and goals (K, 3) that a walk connects, or None if there are none.
 
     Start k lies in the k-th of `zones` (ranges of x, taken in turn); a goal lies `reach` = (least,
     most) metres from its start, measured straight; both keep `margin` m from the border and lie
@@ -298,7 +253,7 @@ def _routes(ground, rng, count, reach, climb=CLIMB, zones=((0, np.inf),), margin
     if home is None:
         return None
     met = inside & (_flood(free, home) >= 0)
-    starts, goals, cells = [], [], []
+    starts, goals = [], []
     for k in range(count):
         s = _pick(rng, zones[k % len(zones)] & met)
         if s is None:
@@ -309,8 +264,7 @@ def _routes(ground, rng, count, reach, climb=CLIMB, zones=((0, np.inf),), margin
             return None
         starts.append((x[s], y[s], z[s], np.arctan2(y[g] - y[s], x[g] - x[s])))
         goals.append((x[g], y[g], z[g]))
-        cells.append(g)
-    return np.array(starts), np.array(goals), _path_lengths(free, cells)
+    return np.array(starts), np.array(goals)
 
 
 # ---------------------------------------------------------------- the training tasks

@@ -201,24 +201,6 @@ def test_a_function_of_another_size_is_a_task():
     assert make_terrain(place, None, None) is place
 
 
-def test_path_lengths_go_around():
-    def wall(rng, difficulty):
-        heights = np.zeros((60, 40))
-        heights[30, :30] = 1.0
-        return heights
-
-    place = make_terrain(wall, np.random.default_rng(0), 1.0)
-    k = next(k for k in range(8) if (place.starts[k, 0] < 6) != (place.goals[k, 0] < 6))
-    (x, y), goal = (5.5, -2.0), place.goals[k]
-    behind = place.path_length(k, 6.7, -2.0)
-    if goal[0] > 6:
-        assert place.path_length(k, x, y) > behind + 4  # the wall's end is 4 m away
-    assert place.path_length(k, *goal[:2]) < 0.2
-    assert np.isfinite(place.paths).all()
-    outside = [place.path_length(k, *p) for p in ((-5, 0), (99, 99), (6, -40))]
-    assert np.isfinite(outside).all()
-
-
 @pytest.mark.parametrize("task, difficulty, named", [
     ("lava", 0.5, "lava.*flat.*crags"), ("flat", 2, "2"), ("flat", -0.1, "-0.1"),
     ("flat", np.nan, "nan"), (lambda rng, d: np.zeros(5), 0.5, "2-D"),
