@@ -638,14 +638,14 @@ def load_actor(name):
     return lambda observation, env: model.mean_action(observation), options, row
 
 
-def make_place(name, seed):
-    """The terrain that episode `seed` of `name` is walked in: a world, a task, or a mesh file."""
-    if name in WORLDS:
-        return make_world(name, seed)
-    if name in PILLAR_TASKS:
-        rng = np.random.default_rng(seed)
-        return make_terrain(name, rng, rng.uniform())
-    return load_mesh(name)
+def make_place(place, seed):
+    """The terrain of episode `seed`: of a world, a task, or a mesh, (path, scale, up)."""
+    if isinstance(place, tuple):
+        return load_mesh(*place)
+    if place in WORLDS:
+        return make_world(place, seed)
+    rng = np.random.default_rng(seed)
+    return make_terrain(place, rng, rng.uniform())
 
 
 def episodes(job):
@@ -688,14 +688,18 @@ def evaluate(actors, places, n_episodes, workers):
 def eval_command(args):
     """`eval`: the table of the paper for one or more policies."""
     rows = [load_actor(actor)[2] for actor in args.policies]  # bad files are named before any work
-    scores = evaluate(args.policies, args.worlds, args.episodes, args.ranks)
+    places = args.worlds
+    if args.mesh:
+        places = [(args.mesh, args.scale, args.up)]
+        load_mesh(*places[0])
+    scores = evaluate(args.policies, places, args.episodes, args.ranks)
     report = {"policies": args.policies, "episodes": args.episodes, "worlds": {}}
     for place, runs in scores.items():
         flat = [run for policy in runs for run in policy]
         mean = {k: float(np.mean([run[k] for run in flat])) for k in flat[0]}
         mean["std"] = float(np.std([run["t_cr"] for run in flat]))
         mean["per_policy"] = [float(np.mean([run["t_cr"] for run in policy])) for policy in runs]
-        report["worlds"][place] = mean
+        report["worlds"][Path(place[0]).stem if args.mesh else place] = mean
     table = report["worlds"]
     report["mean_t_cr"] = float(np.mean([world["t_cr"] for world in table.values()]))
     lines = [
@@ -754,10 +758,8 @@ def _figure(**options):
 def play(args):
     """`play`: one episode in PyBullet's window, or as a GIF and a picture of the path."""
     act, options, _ = load_actor(args.policy)
-    if args.mesh:
-        terrain = load_mesh(args.mesh, args.scale, args.up)
-    else:
-        terrain = make_place(args.world, args.seed)
+    place = (args.mesh, args.scale, args.up) if args.mesh else args.world
+    terrain = make_place(place, args.seed)
     options |= {"gui": True} if args.gui else {"render_mode": "rgb_array"}
     env = gymnasium.make("LocoMTRL-v0", tasks=terrain, disable_env_checker=True,
                          max_episode_steps=round(EVAL_SECONDS / DT), **options)  # fmt: skip
@@ -835,6 +837,12 @@ def _count(text):
     return value
 
 
+def mesh_options(p):
+    p.add_argument("--mesh", metavar="FILE.obj", help="a scanned building instead")
+    p.add_argument("--scale", type=float, default=1.0, help="of the mesh, metres a unit")
+    p.add_argument("--up", choices=("z", "y"), default="z", help="axis of the mesh that points up")
+
+
 def parse(argv):
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     parser = argparse.ArgumentParser("loco_mtrl.py", description=__doc__.split("\n")[0])
@@ -859,6 +867,7 @@ def parse(argv):
                    help=f"a .pt file, or a reference: {', '.join(REFERENCES)}")  # fmt: skip
     p.add_argument("--worlds", type=places, default=list(WORLDS),
                    help="comma-separated worlds, or training tasks on held-out seeds")  # fmt: skip
+    mesh_options(p)
     p.add_argument("--episodes", type=_count, default=20, help="per world (default %(default)s)")
     p.add_argument("--json", metavar="FILE", help="write the scores there, too")
     p.add_argument("--ranks", type=_count, default=cores, help="processes; default: every core")
@@ -868,9 +877,7 @@ def parse(argv):
     p.add_argument("policy", metavar="POLICY", help="as in eval")
     p.add_argument("--world", type=lambda text: places(text)[0], default="maze",
                    help="a world or a training task (default %(default)s)")  # fmt: skip
-    p.add_argument("--mesh", metavar="FILE.obj", help="walk through a scanned building instead")
-    p.add_argument("--scale", type=float, default=1.0, help="of the mesh, metres a unit")
-    p.add_argument("--up", choices=("z", "y"), default="z", help="axis of the mesh that points up")
+    mesh_options(p)
     p.add_argument("--seed", type=int, default=EVAL_SEED, help="layout (default %(default)s)")
     p.add_argument("--gif", metavar="FILE", default="play.gif", help="(default %(default)s)")
     p.add_argument("--lidar", action="store_true", help="draw where the LiDAR's rays hit")

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import psutil
+import pybullet_data
 import pytest
 import torch
 
@@ -107,6 +108,13 @@ def test_eval_prints_the_same_table_twice_and_writes_json(trained):
     assert 0 <= flat["t_cr"] <= 1 and one["episodes"] == 2
 
 
+def test_eval_in_a_scanned_building(tmp_path):
+    mesh = Path(pybullet_data.getDataPath()) / "roboschool/models_outdoor/stadium/stadium.obj"
+    result = run("eval", "zero", "--mesh", mesh, "--scale", 0.5, "--episodes", 1, cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert "stadium" in result.stdout and "mean t_cr" in result.stdout
+
+
 def test_references_need_no_policy(tmp_path):
     result = run("eval", "zero", "straight", "--worlds", "flat", "--episodes", 2, cwd=tmp_path)
     assert result.returncode == 0, result.stderr
@@ -153,6 +161,8 @@ def test_play_writes_a_gif_that_moves_and_a_map(trained):
         (["eval", "zero", "--episodes", "0"], "0"),
         (["play", "zero", "--world", "moon"], "moon"),
         (["play", "zero", "--mesh", "nothing.obj"], "nothing.obj"),
+        (["eval", "zero", "--mesh", "nothing.obj"], "nothing.obj"),
+        (["eval", "zero", "--up", "x"], "'x'"),
     ],
 )
 def test_wrong_calls_end_with_one_clear_line(arguments, named, capsys):
