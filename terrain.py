@@ -622,15 +622,18 @@ def _world(name, rng, plan, mesh, climb, people=0, floor=-np.inf):
     if routes is None:
         return None
     walkers = tuple(_walker(rng, ground, routes[0][0]) for _ in range(people))
-    return Terrain(name, *mesh, *routes, ground, walkers)
+    return None if None in walkers else Terrain(name, *mesh, *routes, ground, walkers)
 
 
 def _walker(rng, ground, start):
-    """A Person on the shortest way between two places, 1.5 m or more from `start` at first."""
+    """A Person on the shortest way between two places, 1.5 m or more from `start` at first.
+
+    None if TRIES draws find no such way.
+    """
     x, y, _, free, *_ = _navigation(ground, LEVEL)
     cell = np.unravel_index(np.argmin(np.hypot(x - start[0], y - start[1])), x.shape)
     met = _flood(free, cell) >= 0
-    while True:
+    for _ in range(TRIES):
         steps = _flood(free, _pick(rng, met))
         if steps.max() < 40:  # 4 m
             continue
@@ -989,7 +992,8 @@ def load_mesh(path, scale=1.0, up="z"):
         rng = np.random.default_rng(0)
         for least in (9, 6, 4, 2, 1):
             for _ in range(5):
-                routes = _routes(ground, rng, 1, (least, 12))
+                # Where there is no floor the plan lies far below: nobody starts or ends there.
+                routes = _routes(ground, rng, 1, (least, 12), floor=z.min())
                 if routes:
                     return Terrain(Path(path).stem, vertices, triangles, *routes, ground)
     raise ValueError(f"{path} has no floor to walk on: is scale {scale}, or up {up!r}, right?")

@@ -311,6 +311,7 @@ def test_bad_worlds_are_named(name, seed, named):
 @pytest.mark.parametrize("file, scale, up", [
     ("samurai_monastry.obj", 1.0, "y"), ("roboschool/models_outdoor/stadium/stadium.obj", 1.0, "z"),
     ("plane100.obj", 0.2, "z"), ("random_urdfs/970/970.obj", 2.0, "y"),
+    ("samurai_monastry.obj", 0.2, "y"), ("samurai_monastry.obj", 0.2, "z"),
 ])  # fmt: skip
 def test_meshes_that_nobody_made_for_us(file, scale, up, client):
     place = load_mesh(DATA / file, scale, up)
