@@ -64,19 +64,25 @@ def joint_angles(feet):
     feet = np.asarray(feet, dtype=np.float64)
     if feet.shape[-2:] != (4, 3):
         raise ValueError(f"feet must have shape (..., 4, 3), got {feet.shape}")
-    x, y, z = feet[..., 0], feet[..., 1], feet[..., 2]
+    angles = []
+    for legs in feet.reshape(-1, 4, 3).tolist():  # plain floats: NumPy pays only for many
+        for foot, side, lateral in zip(legs, SIDE.tolist(), LATERAL.tolist(), strict=True):
+            angles += _leg_angles(*foot, side, lateral)
+    return np.reshape(angles, (*feet.shape[:-2], 12))
+
+
+def _leg_angles(x, y, z, side, lateral):
+    """Abduction, hip and knee of one leg; see `joint_angles`."""
     # Inside the cylinder that the leg plane sweeps around the abduction axis nothing is in reach.
-    square = np.maximum(y * y + z * z - LATERAL**2, 1e-12)
-    down = -np.sqrt(square)
-    # The roll turns (LATERAL, down) to (y, z): the angle between them, from cross and dot product.
-    roll = np.arctan2(LATERAL * z - down * y, LATERAL * y + down * z)
+    square = max(y * y + z * z - lateral * lateral, 1e-12)
+    down = -math.sqrt(square)
+    # The roll turns (lateral, down) to (y, z): the angle between them, from cross and dot product.
+    roll = math.atan2(lateral * z - down * y, lateral * y + down * z)
     cos_knee = (x * x + square - (UPPER**2 + LOWER**2)) / (2 * UPPER * LOWER)
-    cos_knee = np.minimum(np.maximum(cos_knee, -1.0), 1.0)
-    knee = -np.arccos(cos_knee)
-    hip = np.arctan2(-x, -down) - np.arctan2(LOWER * np.sin(knee), UPPER + LOWER * cos_knee)
-    angles = np.empty(feet.shape)
-    angles[..., 0], angles[..., 1], angles[..., 2] = SIDE * roll, hip - HIP_ZERO, knee - KNEE_ZERO
-    return angles.reshape(*feet.shape[:-2], 12)
+    knee = -math.acos(min(max(cos_knee, -1.0), 1.0))
+    shin = math.atan2(LOWER * math.sin(knee), UPPER + LOWER * math.cos(knee))
+    hip = math.atan2(-x, -down) - shin
+    return side * roll, hip - HIP_ZERO, knee - KNEE_ZERO
 
 
 # What the policy modulates: (value at a zero action, half the range that an action in [-1, 1]
