@@ -48,8 +48,8 @@ class PPOConfig:
     max_learning_rate: float = 1e-3  # ... nor above this
     critic_learning_rate: float = 1e-3  # constant: the critic does not move the policy
     target_kl: float = 0.01  # nats by which one update should move the policy
-    init_std: float = 0.37  # of the exploration noise, in units of the action
-    exteroceptive: int = 0  # leading observation entries that get an encoder of their own
+    init_std: float | tuple[float, ...] = 0.37  # of the exploration noise; or one per action entry
+    exteroceptive: tuple[int, int] = (0, 0)  # rows, columns of a scan that leads the observation
     encoder_hidden: tuple[int, ...] = (128, 64)  # layer widths of each encoder
     trunk_hidden: tuple[int, ...] = (64, 64)  # layer widths after the encoders
     checkpoint_every: int = 50  # updates
@@ -61,17 +61,21 @@ class PPOConfig:
                 raise ValueError(f"{name} = {getattr(self, name)!r}, but it must be {valid}")
 
         for name, value in vars(self).items():
-            if name.endswith("_hidden"):
+            if name == "exteroceptive":
+                good = len(value) == 2 and all(isinstance(n, int) and n >= 0 for n in value)
+                check(name, good, "two whole numbers of at least 0, rows and columns")
+            elif name.endswith("_hidden"):
                 good = len(value) > 0 and all(isinstance(w, int) and w >= 1 for w in value)
                 check(name, good, "a non-empty tuple of whole numbers of at least 1")
             elif name in ("gamma", "gae_lambda"):
                 check(name, 0 <= value <= 1, "in [0, 1]")
             elif isinstance(getattr(PPOConfig, name), int):
-                least = 0 if name in ("exteroceptive", "seed") else 1
+                least = 0 if name == "seed" else 1
                 good = isinstance(value, int) and value >= least
                 check(name, good, f"a whole number of at least {least}")
             else:
-                check(name, 0 < value < math.inf, "above 0 and finite")
+                values = value if isinstance(value, tuple) else (value,)
+                check(name, values and all(0 < v < math.inf for v in values), "above 0 and finite")
         low, high = self.min_learning_rate, self.max_learning_rate
         check("learning_rate", low <= self.learning_rate <= high, f"in [{low}, {high}]")
         rows = self.num_envs * self.num_steps
@@ -91,6 +95,23 @@ def mlp(*widths):
     return nn.Sequential(*sum(layers, ()))
 
 
+class ScanEncoder(nn.Module):
+    """One small network reads each column of a scan, the next one reads what it said of them all.
+
+    So what a wall or an edge looks like is learned once, not once for each direction. Maps
+    (..., rows * columns), row by row, to (..., out_dim).
+    """
+
+    def __init__(self, rows, columns, out_dim):
+        super().__init__()
+        self.shape = rows, columns
+        self.column, self.scan = mlp(rows, 32, 16), mlp(16 * columns, out_dim)
+
+    def forward(self, scan):
+        columns = scan.unflatten(-1, self.shape).transpose(-1, -2)
+        return self.scan(self.column(columns).flatten(-2))
+
+
 class TwoEncoders(nn.Module):
     """Exteroceptive and proprioceptive entries, each through its encoder, then one trunk.
 
@@ -99,8 +120,13 @@ class TwoEncoders(nn.Module):
 
     def __init__(self, obs_dim, out_dim, exteroceptive, encoder_hidden, trunk_hidden):
         super().__init__()
-        self.widths = [w for w in (exteroceptive, obs_dim - exteroceptive) if w > 0]
-        self.encoders = nn.ModuleList(mlp(w, *encoder_hidden) for w in self.widths)
+        n_scan = math.prod(exteroceptive)
+        self.widths = [w for w in (n_scan, obs_dim - n_scan) if w > 0]
+        self.encoders = nn.ModuleList()
+        if n_scan > 0:
+            self.encoders.append(ScanEncoder(*exteroceptive, encoder_hidden[-1]))
+        if n_scan < obs_dim:
+            self.encoders.append(mlp(obs_dim - n_scan, *encoder_hidden))
         self.trunk = mlp(encoder_hidden[-1] * len(self.widths), *trunk_hidden)
         self.head = nn.Linear(trunk_hidden[-1], out_dim)
 
@@ -119,21 +145,24 @@ class ActorCritic(nn.Module):
 
     Args:
         obs_dim, act_dim: lengths of the flat observation and action.
-        exteroceptive: how many leading entries of the observation have an encoder of their own.
-        init_std: standard deviation of the exploration noise, the same in every state.
+        exteroceptive: rows and columns of the scan (row by row) that leads the observation and has
+            an encoder of its own; (0, 0): none.
+        init_std: standard deviation of the exploration noise, the same in every state: a number,
+            or one for each entry of the action.
         mirror: None, or (obs_index, obs_sign, act_index, act_sign): the left-right mirror image of
             an observation o is `o[obs_index] * obs_sign`, and likewise for an action. The policy
             is then equivariant by construction, mean(mirror(o)) = mirror(mean(o)), and the value
             invariant. (Mirrored samples as more data would be off-policy: their ratios run away.)
 
-    Raises ValueError if `exteroceptive` exceeds obs_dim, or the mirror is not its own inverse.
+    Raises ValueError if the scan exceeds the observation, the mirror is not its own inverse, or
+    init_std has another length than the action.
     """
 
-    def __init__(self, obs_dim, act_dim, exteroceptive=0, encoder_hidden=(128, 64),
+    def __init__(self, obs_dim, act_dim, exteroceptive=(0, 0), encoder_hidden=(128, 64),
                  trunk_hidden=(64, 64), init_std=0.37, mirror=None):
         super().__init__()
-        if not 0 <= exteroceptive <= obs_dim:
-            raise ValueError(f"exteroceptive = {exteroceptive}, but it must be in [0, {obs_dim}]")
+        if not 0 <= math.prod(exteroceptive) <= obs_dim:
+            raise ValueError(f"a scan of {exteroceptive}, but an observation has {obs_dim} entries")
         self.flip_obs = self.flip_act = None
         if mirror is not None:
             mirror = [np.asarray(part).astype(int).tolist() for part in mirror]
@@ -144,16 +173,19 @@ class ActorCritic(nn.Module):
                     raise ValueError(f"mirror: twice must give {size} entries back: {index} {sign}")
             parts = [torch.tensor(part) for part in mirror]
             self.flip_obs, self.flip_act = parts[:2], parts[2:]
+        std = torch.tensor(init_std, dtype=torch.float32)
+        if std.ndim and len(std) != act_dim:
+            raise ValueError(f"init_std has {len(std)} entries, but an action has {act_dim}")
         # What rebuilds this network, in plain types: it goes into the checkpoint.
-        self.kwargs = {"obs_dim": obs_dim, "act_dim": act_dim, "exteroceptive": exteroceptive,
+        self.kwargs = {"obs_dim": obs_dim, "act_dim": act_dim, "exteroceptive": list(exteroceptive),
                        "encoder_hidden": list(encoder_hidden), "trunk_hidden": list(trunk_hidden),
-                       "init_std": init_std, "mirror": mirror}
+                       "init_std": std.tolist(), "mirror": mirror}
         self.actor = TwoEncoders(obs_dim, act_dim, exteroceptive, encoder_hidden, trunk_hidden)
         self.critic = TwoEncoders(obs_dim, 1, exteroceptive, encoder_hidden, trunk_hidden)
         with torch.no_grad():  # the first policy is the zero action plus noise, in every state
             self.actor.head.weight.mul_(0.01)
             self.actor.head.bias.zero_()
-        self.free_log_std = nn.Parameter(torch.full((act_dim,), math.log(init_std)))
+        self.free_log_std = nn.Parameter(std.log().expand(act_dim).clone())
         # Buffers, so that a policy is never saved, loaded or sent without its normaliser.
         self.register_buffer("count", torch.zeros((), dtype=torch.float64))
         self.register_buffer("obs_mean", torch.zeros(obs_dim, dtype=torch.float64))

@@ -135,6 +135,10 @@ def test_play_writes_a_gif_that_moves_and_a_map(trained):
             gif.seek(k)
             frames.append(np.asarray(gif.convert("RGB"), dtype=int))
     assert np.abs(frames[0] - frames[1]).mean() > 1
+    for frame in frames:  # the robot is the one dark thing there, and the camera follows it
+        rows, columns = np.nonzero(frame.max(-1) < 60)
+        assert rows.size > 500
+        assert (np.abs([rows.mean() - 150, columns.mean() - 200]) < 60).all()
     with Image.open(trained / "walk.png") as picture:
         assert picture.size[0] > 300
 

@@ -163,7 +163,7 @@ def optimiser_of(model):
 
 def test_ratio_is_one_before_the_first_step():
     torch.manual_seed(0)
-    model = ActorCritic(5, 2, 3)
+    model = ActorCritic(5, 2, (1, 3))
     model.update_normaliser(torch.randn(50, 5))
     batch = rollout(model)
     once = PPOConfig(update_epochs=1, num_minibatches=1)
@@ -193,7 +193,7 @@ MIRROR = ([1, 0, 2, 3], [1, 1, -1, 1], [2, 1, 0], [1, -1, 1])
 
 def test_log_prob_is_that_of_torch():
     torch.manual_seed(0)
-    model = ActorCritic(4, 3, 2, mirror=MIRROR)
+    model = ActorCritic(4, 3, (2, 1), mirror=MIRROR)
     torch.nn.init.normal_(model.free_log_std)
     obs, actions = torch.randn(6, 5, 4), torch.randn(6, 5, 3)
     normal = torch.distributions.Normal(model.mean(obs), model.log_std().exp())
@@ -202,6 +202,10 @@ def test_log_prob_is_that_of_torch():
 
 def test_actions_have_the_mean_and_the_std():
     torch.manual_seed(0)
+    model = ActorCritic(2, 2, init_std=(0.5, 2.0))
+    np.testing.assert_allclose(model.log_std().detach().exp(), [0.5, 2.0], rtol=1e-6)
+    with pytest.raises(ValueError, match="3 entries"):
+        ActorCritic(2, 2, init_std=(0.5, 2.0, 1.0))
     model = ActorCritic(2, 2, init_std=0.5)
     noise = model.act(torch.ones(40_000, 2)) - torch.from_numpy(model.mean_action(np.ones(2)))
     assert noise.mean(0).tolist() == pytest.approx([0, 0], abs=0.02)
@@ -210,7 +214,7 @@ def test_actions_have_the_mean_and_the_std():
 
 def test_mirror_is_exact():
     torch.manual_seed(0)
-    plain, model = ActorCritic(4, 3, 2), ActorCritic(4, 3, 2, mirror=MIRROR)
+    plain, model = ActorCritic(4, 3, (1, 2)), ActorCritic(4, 3, (1, 2), mirror=MIRROR)
     data = torch.randn(500, 4) * torch.tensor([1.0, 5.0, 2.0, 0.1]) + 3
     for network in (plain, model):
         network.update_normaliser(data)
@@ -241,10 +245,18 @@ def test_a_mirror_that_is_not_its_own_inverse_is_refused(part):
         ActorCritic(4, 3, mirror=bad)
 
 
-def test_exteroceptive_entries_beyond_the_observation_are_refused():
-    with pytest.raises(ValueError, match="exteroceptive = 5"):
-        ActorCritic(4, 3, exteroceptive=5)
-    for valid in (0, 4):
+def test_a_scan_is_read_column_by_column():
+    torch.manual_seed(0)
+    encoder = ppo.ScanEncoder(3, 4, 5)
+    scan = torch.randn(7, 3, 4)
+    columns = torch.cat([encoder.column(scan[:, :, k]) for k in range(4)], dim=-1)
+    torch.testing.assert_close(encoder(scan.flatten(1)), encoder.scan(columns))
+
+
+def test_a_scan_beyond_the_observation_is_refused():
+    with pytest.raises(ValueError, match=r"scan of \(5, 1\)"):
+        ActorCritic(4, 3, exteroceptive=(5, 1))
+    for valid in ((0, 0), (2, 2)):
         assert ActorCritic(4, 3, exteroceptive=valid).mean_action(np.zeros((7, 4))).shape == (7, 3)
 
 
@@ -387,10 +399,12 @@ def test_rewards_that_are_no_numbers_stop_the_training(reward):
     ("num_minibatches", 1921, "at most 1920"), ("checkpoint_every", 0, "at least 1"),
     ("gamma", 1.01, "[0, 1]"), ("gamma", math.nan, "[0, 1]"), ("gae_lambda", -0.1, "[0, 1]"),
     ("clip_coef", 0, "above 0"), ("max_grad_norm", math.inf, "finite"), ("init_std", -1, "above 0"),
+    ("init_std", (0.1, 0.0), "above 0"), ("init_std", (), "above 0"),
     ("learning_rate", 1.0, "[0.0001, 0.001]"), ("learning_rate", 1e-5, "[0.0001, 0.001]"),
     ("critic_learning_rate", 0.0, "above 0"), ("target_kl", 0.0, "above 0"),
     ("seed", -1, "at least 0"),
-    ("exteroceptive", -1, "at least 0"), ("encoder_hidden", (), "non-empty"),
+    ("exteroceptive", (-1, 2), "at least 0"), ("exteroceptive", (4,), "two whole"),
+    ("encoder_hidden", (), "non-empty"),
     ("trunk_hidden", (64, 0), "at least 1"),
 ])
 def test_bad_settings_are_named(name, value, valid):
@@ -482,7 +496,7 @@ def test_ctrl_c_finishes_the_update_and_keeps_it(tmp_path):
 def test_policy_survives_the_checkpoint_and_is_small(tmp_path):
     torch.manual_seed(0)
     mirror = (range(200), [1] * 200, range(18), [1] * 18)
-    model = ActorCritic(200, 18, 128, mirror=mirror)
+    model = ActorCritic(200, 18, (8, 16), mirror=mirror)
     model.update_normaliser(torch.randn(9, 200))
     ppo.save_checkpoint(tmp_path / "p.pt", model, PPOConfig(), meta={"score": np.float64(0.5)})
     loaded, checkpoint = ppo.load_policy(tmp_path / "p.pt")
@@ -542,7 +556,7 @@ def rank_main(rank, folder):
 def one_update(rows):
     """Statistics and first gradient step from some rows of a fixed rollout."""
     torch.manual_seed(0)
-    model = ActorCritic(5, 2, 3, (16,), (16,))
+    model = ActorCritic(5, 2, (3, 1), (16,), (16,))
     batch = [x[rows] for x in rollout(model)]
     config = PPOConfig(update_epochs=1, num_minibatches=1)
     stats = ppo_update(model, optimiser_of(model), batch, config, torch.Generator())

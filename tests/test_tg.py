@@ -46,11 +46,18 @@ def test_forward_kinematics_agree_with_bullet(bullet_feet, pose):
     np.testing.assert_allclose(tg.foot_position(pose), bullet_feet(pose), atol=1e-4)
 
 
-def test_standing_pose_by_hand():
-    feet = tg.foot_position(tg.STANDING)
+def test_a_pose_by_hand():
+    feet = tg.foot_position(np.tile([0.0, 0.07, -0.59], 4))
     # x = -(U sin h + L sin(h + k)), h = 0.07 + 0.598933, h + k = h - 0.59 - 0.511159
     assert feet[0] == pytest.approx([-0.1564 + 0.1052, -0.032875, -0.1979 - 0.2278], abs=2e-4)
     assert feet[1, 1] == pytest.approx(0.035165)
+
+
+def test_standing_feet_are_below_their_hips():
+    feet = tg.foot_position(tg.STANDING)
+    np.testing.assert_allclose(feet[:, 0], 0, atol=1e-12)
+    np.testing.assert_allclose(feet[:, 1], tg.LATERAL + tg.SIDE * 0.12)
+    np.testing.assert_allclose(feet[:, 2], -0.25)
 
 
 @settings(max_examples=200, deadline=None)
@@ -92,15 +99,16 @@ def test_kinematics_take_batches():
 
 def test_stance_slides_back_and_swing_lifts():
     generator = tg.TrajectoryGenerator()
-    generator.reset(0.0)  # FR and RL touch down, the others are 0.5 / 0.4 = 5 / 6 ... of stance
+    generator.reset(0.0)  # FR and RL touch down, the others take off
     feet = generator.feet()
-    assert feet[0, 0] == pytest.approx(0.10)  # half of the 0.20 m stride ahead
-    assert feet[1, 0] == pytest.approx(0.20 * (0.5 - 0.5 / 0.6))
-    np.testing.assert_allclose(feet[:, 2], -0.32)
-    generator.reset(2 * np.pi * 0.8)  # FR is half through its swing, FL at 0.3 of the cycle
+    np.testing.assert_allclose(feet[:, 0], [0.125, -0.125, -0.125, 0.125])  # half of 0.25 m
+    np.testing.assert_allclose(feet[:, 2], -0.25)
+    generator.reset(2 * np.pi * 0.75)  # FR is half through its swing, FL half through its stance
     feet = generator.feet()
-    assert feet[0] == pytest.approx([0.0, tg.LATERAL[0] - tg.OUTWARD, -0.32 + 0.12])
-    assert feet[1] == pytest.approx([0.0, tg.LATERAL[1] + tg.OUTWARD, -0.32])
+    assert feet[0] == pytest.approx([0.0, tg.LATERAL[0] - 0.12, -0.25 + 0.26])
+    assert feet[1] == pytest.approx([0.0, tg.LATERAL[1] + 0.12, -0.25])
+    generator.reset(2 * np.pi * 0.1)  # a fifth of the stance of FR is over
+    assert generator.feet()[0, 0] == pytest.approx(0.125 - 0.25 / 5)
 
 
 @settings(max_examples=50, deadline=None)
@@ -113,8 +121,9 @@ def test_feet_move_without_jumps(action, phase):
     for _ in range(1000):
         generator.step(action, 1e-3)
         path.append(generator.feet())
-    # 0.5 m of stride in a swing of 0.4 / 4 s at most, 0.2 m of lift along half a sine
-    assert np.abs(np.diff(path, axis=0)).max() < 1e-3 * max(0.5 / 0.1, np.pi * 0.2 / 0.1) + 1e-9
+    # 0.55 m of stride in a swing of 0.5 / 4 s at most, 0.36 m of lift along half a sine
+    fastest = max(0.55 / 0.125, np.pi * 0.36 / 0.125)
+    assert np.abs(np.diff(path, axis=0)).max() < 1e-3 * fastest + 1e-9
 
 
 @settings(max_examples=50, deadline=None)
