@@ -242,6 +242,7 @@ class LocoEnv(gymnasium.Env):
         with _quiet():
             mode = pybullet.GUI if gui else pybullet.DIRECT
             self.bullet = p = BulletClient(connection_mode=mode)
+            p.configureDebugVisualizer(p.COV_ENABLE_GUI, 0)
         for name in HOT:  # BulletClient looks a function up anew for each call, which costs 3 us
             setattr(p, name, getattr(p, name))
         p.setGravity(0, 0, -9.81)
@@ -458,6 +459,10 @@ class LocoEnv(gymnasium.Env):
                 picture[i[seen], j[seen]] = (220, 30, 30)
         return picture
 
+    def follow(self):
+        """Turns the camera of the window (gui=True) to the robot."""
+        self.bullet.resetDebugVisualizerCamera(2.4, self.view_yaw, -40, self.position)
+
     def mirror(self):
         """The left-right symmetry: mirrored, o becomes o[i] * s and an action a becomes a[j] * t.
 
@@ -482,7 +487,8 @@ class LocoEnv(gymnasium.Env):
 
     def close(self):
         if self.bullet is not None:
-            self.bullet.disconnect()
+            with _quiet():  # the window says goodbye at length
+                self.bullet.disconnect()
             self.bullet = None
 
 
@@ -794,6 +800,7 @@ def play(args):
     with tqdm(total=EVAL_SECONDS, unit="s", bar_format="{l_bar}{bar}|{n:.0f}/{total} s") as bar:
         while not ended:
             if args.gui:
+                env.unwrapped.follow()
                 time.sleep(DT)
             elif len(path) % GIF_EVERY == 0:
                 frames.append(env.render())
