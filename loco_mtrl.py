@@ -540,7 +540,7 @@ def train(args):
     with contextlib.closing(LocoEnv("flat", **options)) as env:
         mirror = env.mirror()
     scan = (len(LIDAR_ELEVATIONS), len(LIDAR_AZIMUTHS)) if args.lidar else (0, 0)
-    resume = args.resume
+    resume, on_update = args.resume, tensorboard(run_dir) if args.tensorboard else None
     try:
         for tasks, total_timesteps, num_steps in stages:
             config = PPOConfig(
@@ -557,7 +557,8 @@ def train(args):
             )
             make_env = functools.partial(training_env, seed=args.seed, tasks=tasks, **options)
             learn(make_env, config, run_dir=run_dir, resume=resume, mirror=mirror, meta=meta,
-                  episode_keys=("t_cr", "success", "fall", "exploded"), groups=args.tasks)
+                  episode_keys=("t_cr", "success", "fall", "exploded"), groups=args.tasks,
+                  on_update=on_update)
             resume = True
     except KeyboardInterrupt:
         if int(os.environ.get("RANK", 0)) == 0:
@@ -569,6 +570,22 @@ def train(args):
         torch.save(checkpoint, run_dir / "policy.pt")
         print(f"Policy: {run_dir / 'policy.pt'}   Curve: {run_dir / 'curve.png'}")
     return 0
+
+
+def tensorboard(run_dir):
+    """An `on_update` for `learn` that also writes progress.csv's columns for TensorBoard."""
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError:
+        raise ValueError("--tensorboard needs TensorBoard: pip install tensorboard") from None
+    writer = SummaryWriter(run_dir)
+
+    def on_update(_, row):
+        for name, value in row.items():
+            writer.add_scalar(name, value, row["steps"])
+        writer.flush()
+
+    return on_update
 
 
 def launch(args):
@@ -891,6 +908,7 @@ def parse(argv):
     p.add_argument("--seed", type=int, default=0)
     p.add_argument("--run-dir", default="runs/main", help="(default %(default)s)")
     p.add_argument("--resume", action="store_true", help="go on from the run's checkpoint")
+    p.add_argument("--tensorboard", action="store_true", help="log for TensorBoard, too")
     p.add_argument("--ranks", type=_count, default=cores, help="processes; default: every core")
     p.set_defaults(run=train)
 
