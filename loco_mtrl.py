@@ -145,7 +145,7 @@ FALL_UP, FALL_SPEED = 0.5, 2.5  # fallen: tipped by over 60 degrees, or dropping
 MAX_EPISODE_STEPS = 600  # 20 s
 PICTURE = (400, 300)  # pixels
 HOT = ("setJointMotorControlArray", "stepSimulation", "getBasePositionAndOrientation",
-       "getBaseVelocity", "getMatrixFromQuaternion", "getJointStates", "rayTestBatch")  # fmt: skip
+       "getBaseVelocity", "getMatrixFromQuaternion", "getJointStates", "rayTestBatch")
 STATIC_GROUP = 2  # Bullet's collision group of all that does not move by itself: rays see only it
 
 
@@ -204,7 +204,7 @@ class LocoEnv(gymnasium.Env):
     metadata = {"render_modes": ["rgb_array"], "render_fps": round(1 / DT)}
 
     def __init__(self, tasks=None, difficulty=(0.0, 1.0), tg=True, lidar=True, terrains=1,
-                 pool_seed=0, render_mode=None, gui=False):  # fmt: skip
+                 pool_seed=0, render_mode=None, gui=False):
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
         low, high = np.broadcast_to(difficulty, 2)
@@ -218,11 +218,8 @@ class LocoEnv(gymnasium.Env):
         if not tasks:
             raise ValueError(f"tasks must hold at least one task; valid: {', '.join(PILLAR_TASKS)}")
         rng = np.random.default_rng(pool_seed)
-        self.pool = [
-            make_terrain(task, rng, rng.uniform(low, high))
-            for task in tasks
-            for _ in range(1 if isinstance(task, Terrain) else terrains)
-        ]
+        self.pool = [make_terrain(task, rng, rng.uniform(low, high)) for task in tasks
+                     for _ in range(1 if isinstance(task, Terrain) else terrains)]
         self.generator = TrajectoryGenerator() if tg else None
         self._connect(gui)
         self.n_rays = N_RAYS if lidar else 0
@@ -246,9 +243,8 @@ class LocoEnv(gymnasium.Env):
         for name in HOT:  # BulletClient looks a function up anew for each call, which costs 3 us
             setattr(p, name, getattr(p, name))
         p.setGravity(0, 0, -9.81)
-        p.setPhysicsEngineParameter(
-            fixedTimeStep=DT, numSubSteps=SUBSTEPS, numSolverIterations=20, enableConeFriction=0
-        )
+        p.setPhysicsEngineParameter(fixedTimeStep=DT, numSubSteps=SUBSTEPS, numSolverIterations=20,
+                                    enableConeFriction=0)
         # Side by side, farther apart than the LiDAR reaches: a reset only moves the robot.
         self.offsets, edge = [], 0.0
         for terrain in self.pool:
@@ -272,11 +268,8 @@ class LocoEnv(gymnasium.Env):
             sphere = p.createVisualShape(p.GEOM_SPHERE, radius=0.2, rgbaColor=(0.2, 0.8, 0.3, 1))
             self.flag = p.createMultiBody(0, -1, sphere)
         self._rays = [LIDAR_POSITION] * N_RAYS, ends.tolist()
-        self._gains = dict(
-            positionGains=[POSITION_GAIN] * 12,
-            velocityGains=[VELOCITY_GAIN] * 12,
-            forces=[MAX_TORQUE] * 12,
-        )
+        self._gains = dict(positionGains=[POSITION_GAIN] * 12, velocityGains=[VELOCITY_GAIN] * 12,
+                           forces=[MAX_TORQUE] * 12)
 
     def _load_robot(self):
         p = self.bullet
@@ -367,9 +360,8 @@ class LocoEnv(gymnasium.Env):
             self.target = self.generator.step(self.action[:n], DT) + u_fb
         else:
             self.target = STANDING + RESIDUAL[False] * self.action
-        p.setJointMotorControlArray(
-            self.robot, self.joints, p.POSITION_CONTROL, self.target.tolist(), **self._gains
-        )
+        p.setJointMotorControlArray(self.robot, self.joints, p.POSITION_CONTROL,
+                                    self.target.tolist(), **self._gains)
         p.stepSimulation()
         self.time += DT
         if self.people:
@@ -393,22 +385,15 @@ class LocoEnv(gymnasium.Env):
 
     def _info(self, success, fall):
         progress = 1.0 if success else 1.0 - self.distance / self.start_distance
-        return {
-            "task": self.terrain.name,
-            "t_cr": max(0.0, progress),
-            "success": success,
-            "fall": fall and not success,
-            "collisions": self.collisions,
-            "exploded": self.exploded,
-        }
+        return {"task": self.terrain.name, "t_cr": max(0.0, progress), "success": success,
+                "fall": fall and not success, "collisions": self.collisions,
+                "exploded": self.exploded}
 
     def _move_people(self):
         for body, person in zip(self.people, self.terrain.people, strict=False):
             x, y, yaw = person.position(self.time)
-            z = self.terrain.height(x, y) + PERSON_HEIGHT / 2
-            self.bullet.resetBasePositionAndOrientation(
-                body, (x + self.origin[0], y, z), _about_z(yaw)
-            )
+            place = x + self.origin[0], y, self.terrain.height(x, y) + PERSON_HEIGHT / 2
+            self.bullet.resetBasePositionAndOrientation(body, place, _about_z(yaw))
 
     def _observe(self):
         p = self.bullet
@@ -429,12 +414,8 @@ class LocoEnv(gymnasium.Env):
         observation = np.empty(self.observation_space.shape, dtype=np.float32)
         observation[self.n_rays :] = state
         if self.n_rays:
-            self.hits = p.rayTestBatch(
-                *self._rays,
-                parentObjectUniqueId=self.robot,
-                parentLinkIndex=-1,
-                collisionFilterMask=STATIC_GROUP,
-            )
+            self.hits = p.rayTestBatch(*self._rays, parentObjectUniqueId=self.robot,
+                                       parentLinkIndex=-1, collisionFilterMask=STATIC_GROUP)
             observation[: self.n_rays] = list(map(HIT_FRACTION, self.hits))
         return observation
 
@@ -443,10 +424,8 @@ class LocoEnv(gymnasium.Env):
         p, (width, height) = self.bullet, PICTURE
         view = p.computeViewMatrixFromYawPitchRoll(self.position, 2.4, self.view_yaw, -52, 0, 2)
         projection = p.computeProjectionMatrixFOV(55, width / height, 0.1, 40)
-        rgba = p.getCameraImage(
-            width, height, view, projection, renderer=p.ER_TINY_RENDERER,
-            lightDirection=(2, 3, 8),
-        )[2]  # fmt: skip
+        rgba = p.getCameraImage(width, height, view, projection, lightDirection=(2, 3, 8),
+                                renderer=p.ER_TINY_RENDERER)[2]
         picture = np.reshape(rgba, (height, width, 4))[..., :3].astype(np.uint8)
         if self.show_lidar:
             points = np.array([(*hit[3], 1.0) for hit in self.hits if hit[2] < 1])
@@ -479,10 +458,8 @@ class LocoEnv(gymnasium.Env):
         if self.generator:
             parts += [swap, swap, parameters]
             actions = [parameters, legs]
-        chain = [
-            np.concatenate([p + sum(map(len, group[:k])) for k, p in enumerate(group)])
-            for group in (parts, actions)
-        ]
+        chain = [np.concatenate([p + sum(map(len, group[:k])) for k, p in enumerate(group)])
+                 for group in (parts, actions)]
         return chain[0], signs, chain[1], np.ones(self.action_space.shape)
 
     def close(self):
@@ -509,9 +486,8 @@ INIT_STD = np.array([0.37, 0.8, 0.8, 0.37, 0.37] + [0.37] * 12)
 
 def training_env(index, seed, **options):
     """Environment number `index` over all ranks, with a pool of terrains of its own."""
-    env = gymnasium.make(
-        "LocoMTRL-v0", disable_env_checker=True, pool_seed=(seed, index), **options
-    )
+    env = gymnasium.make("LocoMTRL-v0", disable_env_checker=True, pool_seed=(seed, index),
+                         **options)
     return gymnasium.wrappers.TransformReward(env, lambda reward: REWARD_SCALE * reward)
 
 
@@ -523,14 +499,8 @@ def train(args):
             load_checkpoint(run_dir / "checkpoint.pt")  # a bad one is better named by one process
         return launch(args)
     options = {"tg": args.tg, "lidar": args.lidar}
-    meta = {
-        **options,
-        "tasks": args.tasks,
-        "sequential": args.sequential,
-        "seed": args.seed,
-        "command": "python loco_mtrl.py " + " ".join(args.argv),
-        "commit": _commit(),
-    }
+    meta = {**options, "tasks": args.tasks, "sequential": args.sequential, "seed": args.seed,
+            "command": "python loco_mtrl.py " + " ".join(args.argv), "commit": _commit()}
     # Each stage resumes the one before it: tasks, steps in all at its end, steps of a rollout.
     if args.sequential:  # one task after the other (section 3)
         n = len(args.tasks)
@@ -544,16 +514,11 @@ def train(args):
     try:
         for tasks, total_timesteps, num_steps in stages:
             config = PPOConfig(
-                total_timesteps=total_timesteps,
-                num_envs=10,
-                num_steps=num_steps,
-                num_minibatches=num_steps // 50,
+                total_timesteps=total_timesteps, num_envs=10, num_steps=num_steps,
+                num_minibatches=num_steps // 50, seed=args.seed, exteroceptive=scan,
                 gamma=0.995,  # a detour pays after seconds: 200 steps are 6.7 s
-                learning_rate=5e-4,
-                target_kl=0.015,
+                learning_rate=5e-4, target_kl=0.015,
                 init_std=tuple(INIT_STD[-len(mirror[2]) :].tolist()),
-                exteroceptive=scan,
-                seed=args.seed,
             )
             make_env = functools.partial(training_env, seed=args.seed, tasks=tasks, **options)
             learn(make_env, config, run_dir=run_dir, resume=resume, mirror=mirror, meta=meta,
@@ -605,7 +570,7 @@ def launch(args):
         if failure.exitcode > 0:
             return failure.exitcode  # the rank itself has said what is wrong
         print(f"loco_mtrl.py: error: rank {rank} was killed by signal {-failure.exitcode}. "
-              f"To go on from the last checkpoint: {_again(args)}", file=sys.stderr)  # fmt: skip
+              f"To go on from the last checkpoint: {_again(args)}", file=sys.stderr)
         return 1
     return 0
 
@@ -704,7 +669,7 @@ def episodes(job):
     for actor in actors:
         act, options, _ = load_actor(actor)
         env = gymnasium.make("LocoMTRL-v0", tasks=terrain, disable_env_checker=True,
-                             max_episode_steps=round(EVAL_SECONDS / DT), **options)  # fmt: skip
+                             max_episode_steps=round(EVAL_SECONDS / DT), **options)
         observation, info = env.reset(seed=seed)
         ended = False
         while not ended:
@@ -750,18 +715,13 @@ def eval_command(args):
         report["worlds"][Path(place[0]).stem if args.mesh else place] = mean
     table = report["worlds"]
     report["mean_t_cr"] = float(np.mean([world["t_cr"] for world in table.values()]))
-    lines = [
-        ("", list(table)),
-        ("t_cr", [f"{w['t_cr']:.2f}" for w in table.values()]),
-        ("+- std", [f"{w['std']:.2f}" for w in table.values()]),
-    ]
+    lines = [("", list(table)), ("t_cr", [f"{w['t_cr']:.2f}" for w in table.values()]),
+             ("+- std", [f"{w['std']:.2f}" for w in table.values()])]
     if len(set(rows)) == 1 and rows[0] and list(table) == list(WORLDS):
         figures = ["0." + figure for figure in PAPER[rows[0]].split()]
         lines += [(f"paper: {rows[0]}", figures[:8]), ("+- std", figures[8:])]
-    lines += [
-        (key, [f"{w[key]:.2f}" for w in table.values()])
-        for key in ("success", "fall", "collisions", "seconds")
-    ]
+    for key in ("success", "fall", "collisions", "seconds"):
+        lines.append((key, [f"{w[key]:.2f}" for w in table.values()]))
     for name, cells in lines:
         print(f"{name:18}" + "".join(f"{cell:>14}" for cell in cells))
     for k, actor in enumerate(args.policies):
@@ -810,7 +770,7 @@ def play(args):
     terrain = make_place(place, args.seed)
     options |= {"gui": True} if args.gui else {"render_mode": "rgb_array"}
     env = gymnasium.make("LocoMTRL-v0", tasks=terrain, disable_env_checker=True,
-                         max_episode_steps=round(EVAL_SECONDS / DT), **options)  # fmt: skip
+                         max_episode_steps=round(EVAL_SECONDS / DT), **options)
     env.unwrapped.show_lidar = args.lidar
     observation, info = env.reset(seed=args.seed)
     frames, path, ended = [], [], False
@@ -833,7 +793,7 @@ def play(args):
         palette = Image.fromarray(np.concatenate(frames[:: len(frames) // 8 + 1])).quantize(64)
         pictures = [Image.fromarray(frame).quantize(palette=palette, dither=0) for frame in frames]
         pictures[0].save(args.gif, save_all=True, append_images=pictures[1:], loop=0,
-                         duration=round(1000 * GIF_EVERY * DT))  # fmt: skip
+                         duration=round(1000 * GIF_EVERY * DT))
         figure = _figure(figsize=(6, 5))
         axis = figure.subplots()
         draw_map(axis, terrain)
@@ -871,9 +831,8 @@ def _names(valid, what):
         names = text.split(",")
         for name in names:
             if name not in valid:
-                raise argparse.ArgumentTypeError(
-                    f"unknown {what} {name!r}; valid: {', '.join(valid)}"
-                )
+                known = ", ".join(valid)
+                raise argparse.ArgumentTypeError(f"unknown {what} {name!r}; valid: {known}")
         return names
 
     return parse
@@ -901,7 +860,7 @@ def parse(argv):
     p = commands.add_parser("train", help="train a policy")
     p.add_argument("--steps", type=_count, default=MAIN_STEPS, help="of the environment, in all")
     p.add_argument("--tasks", type=_names(PILLAR_TASKS, "task"), default=list(PILLAR_TASKS),
-                   help="comma-separated; default: all %(default)s")  # fmt: skip
+                   help="comma-separated; default: all %(default)s")
     p.add_argument("--no-tg", dest="tg", action="store_false", help="reactive policy")
     p.add_argument("--no-lidar", dest="lidar", action="store_false", help="blind policy")
     p.add_argument("--sequential", action="store_true", help="one task after the other, not mixed")
@@ -914,9 +873,9 @@ def parse(argv):
 
     p = commands.add_parser("eval", help="score policies in worlds they never saw")
     p.add_argument("policies", nargs="+", metavar="POLICY",
-                   help=f"a .pt file, or a reference: {', '.join(REFERENCES)}")  # fmt: skip
+                   help=f"a .pt file, or a reference: {', '.join(REFERENCES)}")
     p.add_argument("--worlds", type=places, default=list(WORLDS),
-                   help="comma-separated worlds, or training tasks on held-out seeds")  # fmt: skip
+                   help="comma-separated worlds, or training tasks on held-out seeds")
     mesh_options(p)
     p.add_argument("--episodes", type=_count, default=20, help="per world (default %(default)s)")
     p.add_argument("--json", metavar="FILE", help="write the scores there, too")
@@ -926,7 +885,7 @@ def parse(argv):
     p = commands.add_parser("play", help="watch a policy for one episode")
     p.add_argument("policy", metavar="POLICY", help="as in eval")
     p.add_argument("--world", type=lambda text: places(text)[0], default="maze",
-                   help="a world or a training task (default %(default)s)")  # fmt: skip
+                   help="a world or a training task (default %(default)s)")
     mesh_options(p)
     p.add_argument("--seed", type=int, default=EVAL_SEED, help="layout (default %(default)s)")
     p.add_argument("--gif", metavar="FILE", default="play.gif", help="(default %(default)s)")

@@ -121,10 +121,9 @@ def _quads(*corners):
 def _join(parts):
     """One mesh from several (vertices, triangles)."""
     offsets = np.cumsum([0] + [len(v) for v, _ in parts[:-1]])
-    return (
-        np.concatenate([v for v, _ in parts]).astype(float),
-        np.concatenate([t + o for (_, t), o in zip(parts, offsets, strict=True)]).astype(np.int32),
-    )
+    triangles = [t + o for (_, t), o in zip(parts, offsets, strict=True)]
+    return (np.concatenate([v for v, _ in parts]).astype(float),
+            np.concatenate(triangles).astype(np.int32))
 
 
 def _runs(*layers):
@@ -201,9 +200,8 @@ def _navigation(ground, climb):
     `solid`, not a hole. Holes up to 0.2 m across are filled first: legs step over those.
     """
     nx, ny = (max(round(s / CELL), 3) for s in ground.size)
-    x, y = np.meshgrid(
-        (np.arange(nx) + 0.5) * CELL, (np.arange(ny) + 0.5 - ny / 2) * CELL, indexing="ij"
-    )
+    i, j = np.indices((nx, ny))
+    x, y = (i + 0.5) * CELL, (j + 0.5 - ny / 2) * CELL
     z = np.maximum(ground(x, y), -1e3)
     filled = _window(_window(z, 1, np.max), 1, np.min)
     edge = np.ones(z.shape, bool)
@@ -237,7 +235,7 @@ def _pick(rng, mask):
 
 
 def _routes(ground, rng, count, reach, climb=CLIMB, zones=((0, np.inf),), margin=0.5,
-            floor=-np.inf):  # fmt: skip
+            floor=-np.inf):
     """`count` starts (K, 4) and goals (K, 3) that a walk connects, or None if there are none.
 
     Start k lies in the k-th of `zones` (ranges of x, taken in turn); a goal lies `reach` = (least,
@@ -271,9 +269,8 @@ def _routes(ground, rng, count, reach, climb=CLIMB, zones=((0, np.inf),), margin
 
 # Pillar centres in m. U is the way into the task: 0 up to the flat strip's edge, then growing, so
 # whatever depends on U alone meets both strips without a step.
-X, Y = np.meshgrid(
-    (np.arange(SHAPE[0]) + 0.5) * L, (np.arange(SHAPE[1]) + 0.5 - SHAPE[1] / 2) * W, indexing="ij"
-)
+_I, _J = np.indices(SHAPE)
+X, Y = (_I + 0.5) * L, (_J + 0.5 - SHAPE[1] / 2) * W
 U = np.clip(X, PAD * L, (SHAPE[0] - PAD) * L) - PAD * L
 SPAN = U.max()  # m, 8.4
 
@@ -535,7 +532,7 @@ PILLAR_TASKS = {
         pyramids_down, gaps, hurdles, ridges, pits, coasts, corridors, walls, rooms, mazes,
         screens, traps, blocks, poles, waves, fractal, crags,
     )
-}  # fmt: skip
+}
 
 
 def make_terrain(task, rng, difficulty):
@@ -612,7 +609,7 @@ def _box_mesh(boxes):
         _quads((x1, y1, z0), (x0, y1, z0), (x0, y1, z1), (x1, y1, z1)),
         _quads((x1, y0, z0), (x1, y1, z0), (x1, y1, z1), (x1, y0, z1)),
         _quads((x0, y1, z0), (x0, y0, z0), (x0, y0, z1), (x0, y1, z1)),
-    ])  # fmt: skip
+    ])
 
 
 def _world(name, rng, plan, mesh, climb, people=0, floor=-np.inf):
@@ -686,9 +683,8 @@ def _smooth(rng, size, cell, coarse, octaves, degrees):
     A level spot of 0.7 m radius, eased into the slope, is made at its low end to start from.
     """
     shape = tuple(round(s / cell) + 1 for s in size)
-    nodes = sum(
-        _noise(rng, shape, tuple(c * 2**k + 1 for c in coarse)) / 2.6**k for k in range(octaves)
-    )
+    nodes = sum(_noise(rng, shape, tuple(c * 2**k + 1 for c in coarse)) / 2.6**k
+                for k in range(octaves))
     slope = np.hypot(*np.gradient(nodes, cell))
     nodes *= np.tan(np.radians(degrees)) / np.percentile(slope, 95)
     x, y = np.indices(shape) * cell
@@ -826,7 +822,7 @@ def _furnish(rng, plan, rooms):
         x1, y1 = x0 + a * FINE, y0 + b * FINE
         boxes.append((x0, x1, y0, y1, z - 0.04, z))
         boxes.extend((x, x + 0.05, y, y + 0.05, 0, z - 0.04)
-                     for x in (x0, x1 - 0.05) for y in (y0, y1 - 0.05) if legs)  # fmt: skip
+                     for x in (x0, x1 - 0.05) for y in (y0, y1 - 0.05) if legs)
 
     for i0, i1, j0, j1 in rooms:
         i, j = rng.integers(i0 + 1, i1 - 5), rng.integers(j0 + 1, j1 - 9)
@@ -869,10 +865,8 @@ def dynamic(rng):
     return _office("dynamic", rng, _open_plan if rng.random() < 0.5 else _corridor_plan, people=5)
 
 
-WORLDS = {
-    world.__name__: world
-    for world in (maze, mountain, office1, office2, dynamic, forest, cliff, continuous)
-}
+WORLDS = {world.__name__: world for world in (
+    maze, mountain, office1, office2, dynamic, forest, cliff, continuous)}
 
 
 def make_world(name, seed):
@@ -967,10 +961,8 @@ def load_mesh(path, scale=1.0, up="z"):
     if triangles.min() < 0 or triangles.max() >= len(vertices):
         raise ValueError(f"{path} is not a mesh: a face names a vertex that is not there")
     if len(vertices) > MAX_VERTICES or triangles.size > MAX_INDICES:
-        raise ValueError(
-            f"{path} is too large for PyBullet: {len(vertices)} vertices (at most {MAX_VERTICES}), "
-            f"{triangles.size} indices (at most {MAX_INDICES})"
-        )
+        raise ValueError(f"{path} is too large for PyBullet: {len(vertices)} vertices (at most "
+                         f"{MAX_VERTICES}), {triangles.size} indices (at most {MAX_INDICES})")
     if up == "y":
         vertices = np.stack([vertices[:, 2], vertices[:, 0], vertices[:, 1]], 1)
     vertices = vertices * scale
