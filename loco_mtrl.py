@@ -479,6 +479,9 @@ REWARD_SCALE = 0.1  # keeps the critic's targets near 1; the environment's own r
 MAIN_STEPS = 2_500_000  # of the no-argument run
 # Short rollouts learn fastest at first; later the noise of so few samples holds the policy back.
 SHORT, LONG, SHORT_UNTIL = 256, 512, 400_000
+# A policy is judged without the noise, which has freed it wherever it was stuck: so the last part
+# of the training has little of it.
+QUIET, QUIET_STD = 0.2, 0.2
 # Standard deviation of the exploration noise: large on the two strides, for a way around must be
 # steered for a second before it pays; small on all else, or the noise throws the robot over.
 INIT_STD = np.array([0.37, 0.8, 0.8, 0.37, 0.37] + [0.37] * 12)
@@ -501,24 +504,26 @@ def train(args):
     options = {"tg": args.tg, "lidar": args.lidar}
     meta = {**options, "tasks": args.tasks, "sequential": args.sequential, "seed": args.seed,
             "command": "python loco_mtrl.py " + " ".join(args.argv), "commit": _commit()}
-    # Each stage resumes the one before it: tasks, steps in all at its end, steps of a rollout.
+    # Each stage resumes the one before: tasks, steps at its end, steps of a rollout, largest std.
     if args.sequential:  # one task after the other (section 3)
         n = len(args.tasks)
-        stages = [([t], args.steps * (k + 1) // n, SHORT) for k, t in enumerate(args.tasks)]
+        stages = [([t], args.steps * (k + 1) // n, SHORT, 1) for k, t in enumerate(args.tasks)]
     else:
-        stages = [(args.tasks, min(SHORT_UNTIL, args.steps), SHORT), (args.tasks, args.steps, LONG)]
+        loud = round((1 - QUIET) * args.steps)
+        stages = [(args.tasks, min(SHORT_UNTIL, loud), SHORT, 1), (args.tasks, loud, LONG, 1),
+                  (args.tasks, args.steps, LONG, QUIET_STD)]
     with contextlib.closing(LocoEnv("flat", **options)) as env:
         mirror = env.mirror()
     scan = (len(LIDAR_ELEVATIONS), len(LIDAR_AZIMUTHS)) if args.lidar else (0, 0)
     resume, on_update = args.resume, tensorboard(run_dir) if args.tensorboard else None
     try:
-        for tasks, total_timesteps, num_steps in stages:
+        for tasks, total_timesteps, num_steps, max_std in stages:
             config = PPOConfig(
                 total_timesteps=total_timesteps, num_envs=10, num_steps=num_steps,
                 num_minibatches=num_steps // 50, seed=args.seed, exteroceptive=scan,
                 gamma=0.995,  # a detour pays after seconds: 200 steps are 6.7 s
                 learning_rate=5e-4, target_kl=0.015,
-                init_std=tuple(INIT_STD[-len(mirror[2]) :].tolist()),
+                init_std=tuple(INIT_STD[-len(mirror[2]) :].tolist()), max_std=max_std,
             )
             make_env = functools.partial(training_env, seed=args.seed, tasks=tasks, **options)
             learn(make_env, config, run_dir=run_dir, resume=resume, mirror=mirror, meta=meta,

@@ -49,6 +49,7 @@ class PPOConfig:
     critic_learning_rate: float = 1e-3  # constant: the critic does not move the policy
     target_kl: float = 0.01  # nats by which one update should move the policy
     init_std: float | tuple[float, ...] = 0.37  # of the exploration noise; or one per action entry
+    max_std: float = 10.0  # upper bound of that noise at any time
     exteroceptive: tuple[int, int] = (0, 0)  # rows, columns of a scan that leads the observation
     encoder_hidden: tuple[int, ...] = (128, 64)  # layer widths of each encoder
     trunk_hidden: tuple[int, ...] = (64, 64)  # layer widths after the encoders
@@ -209,6 +210,11 @@ class ActorCritic(nn.Module):
         """Logarithm of the exploration noise's standard deviation: (act,)."""
         free = self.free_log_std
         return (free + free[self.flip_act[0]]) / 2 if self.flip_act else free
+
+    @torch.no_grad()
+    def limit_std(self, max_std):
+        """Keep the exploration noise's standard deviation at `max_std` or below."""
+        self.free_log_std.clamp_(max=math.log(max_std))
 
     def value(self, obs):
         """Expected discounted return: (..., obs) -> (...)."""
@@ -514,6 +520,7 @@ def learn(make_env, config, *, run_dir=None, resume=False, mirror=None, init=Non
     if checkpoint:
         optimiser.load_state_dict(checkpoint["optimiser"])
         update, steps, minutes_before = checkpoint["counters"].values()
+    model.limit_std(config.max_std)
 
     obs = torch.zeros(num_steps + 1, num_envs, dims["obs_dim"])
     actions = torch.zeros(num_steps, num_envs, dims["act_dim"])
@@ -569,6 +576,7 @@ def learn(make_env, config, *, run_dir=None, resume=False, mirror=None, init=Non
                                               config.gamma, config.gae_lambda)
             batch = [x[~prev_done] for x in (obs[:-1], actions, log_prob, advantages, returns)]
             stats = ppo_update(model, optimiser, batch, config, generator)
+            model.limit_std(config.max_std)
             # Only now: while learning, the old and the new policy must see the same scale.
             model.update_normaliser(batch[0])
             if not all(tensor.isfinite().all() for tensor in model.state_dict().values()):

@@ -345,6 +345,13 @@ def test_seeds_never_overlap():
     assert len(seen) >= 4 * 4 and len(set(seen)) == len(seen)
 
 
+def test_the_noise_never_exceeds_its_bound():
+    stds = []
+    learn(lambda index: Square(1.0), PPOConfig(total_timesteps=600, max_std=0.2, **SMALL),
+          on_update=lambda model, row: stds.append(row["std"]))
+    assert len(stds) >= 2 and max(stds) <= 0.2 + 1e-6
+
+
 def test_init_starts_from_a_trained_policy():
     old = train(Probe, 3)
     config = PPOConfig(total_timesteps=1, learning_rate=1e-12, min_learning_rate=1e-12,
@@ -399,7 +406,8 @@ def test_rewards_that_are_no_numbers_stop_the_training(reward):
     ("num_minibatches", 1921, "at most 1920"), ("checkpoint_every", 0, "at least 1"),
     ("gamma", 1.01, "[0, 1]"), ("gamma", math.nan, "[0, 1]"), ("gae_lambda", -0.1, "[0, 1]"),
     ("clip_coef", 0, "above 0"), ("max_grad_norm", math.inf, "finite"), ("init_std", -1, "above 0"),
-    ("init_std", (0.1, 0.0), "above 0"), ("init_std", (), "above 0"),
+    ("max_std", math.nan, "above 0"), ("init_std", (0.1, 0.0), "above 0"),
+    ("init_std", (), "above 0"),
     ("learning_rate", 1.0, "[0.0001, 0.001]"), ("learning_rate", 1e-5, "[0.0001, 0.001]"),
     ("critic_learning_rate", 0.0, "above 0"), ("target_kl", 0.0, "above 0"),
     ("seed", -1, "at least 0"),
