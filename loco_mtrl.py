@@ -232,7 +232,7 @@ class LocoEnv(gymnasium.Env):
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (n_act,))
         self.smoothing = SMOOTHING[-n_act:]
         self.spent = np.zeros(len(self.pool))  # seconds in each terrain, those of failures cheap
-        self.time, self.index = 0.0, 0
+        self.time = 0.0
 
     def _connect(self, gui):
         self.visual = visual = gui or self.render_mode is not None
@@ -282,8 +282,8 @@ class LocoEnv(gymnasium.Env):
         self.joints = [ids[f"{leg}_{joint}"] for leg in LEGS for joint in JOINTS]
 
     def _add_mesh(self, terrain, offset, visual):
-        p, corners = self.bullet, terrain.vertices.tolist()
-        mesh = dict(vertices=corners, indices=terrain.triangles.ravel().tolist())
+        p = self.bullet
+        mesh = dict(vertices=terrain.vertices.tolist(), indices=terrain.triangles.ravel().tolist())
         shape = p.createCollisionShape(p.GEOM_MESH, flags=p.GEOM_FORCE_CONCAVE_TRIMESH, **mesh)
         body = p.createMultiBody(0, shape, basePosition=(offset, 0, 0))
         p.changeDynamics(body, -1, lateralFriction=1.0)

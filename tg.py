@@ -85,12 +85,12 @@ def _leg_angles(leg, x, y, z):
 
 # What the policy modulates: (value at a zero action, half the range that an action in [-1, 1]
 # spans). The zero action is a trot that walks by itself, crouched and with feet lifted high: on
-# rough ground, with exploration noise, it falls a fifth as often as legs stretched to 0.32 m do.
+# rough ground, with exploration noise, it falls less than half as often as legs of 0.32 m do.
 PARAMETERS = {
     "frequency": (3.0, 1.0),  # Hz, strides a second
     "left_stride": (0.25, 0.30),  # m, travel of the left feet during stance; negative walks back
     "right_stride": (0.25, 0.30),  # m; unlike the left one, it turns the robot
-    "swing_height": (0.26, 0.10),  # m, lift of the feet in mid-swing; soft legs reach half of it
+    "swing_height": (0.26, 0.10),  # m, lift of the feet in mid-swing; soft legs reach 0.14-0.18 m
     "stance_height": (0.25, 0.07),  # m, hips above the feet
 }
 CENTRE, RANGE = np.array(list(PARAMETERS.values())).T
