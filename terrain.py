@@ -21,6 +21,7 @@ SHAPE = (60, 40)  # m x n pillars: 12 m x 8 m
 
 CELL = 0.1  # m, navigation grid; a disc of 0.25 m radius is known on it to half a cell
 CLIMB = 0.12  # m, highest step that Laikago's feet clear with room to spare
+STEP = 0.2  # m, highest step that they clear at all: what training may ask for
 FLAT = 0.05  # m, most that the ground under a start may vary
 PAD = 9  # pillars, depth of the flat strip at both ends where episodes start (1.8 m)
 ROUTES = 8  # start and goal pairs per training terrain
@@ -321,8 +322,8 @@ def flat(rng, difficulty):
 
 
 def rugged(rng, difficulty):
-    """Every pillar's height uniform in [0, 0.13 m] (paper figure 3b)."""
-    return rng.uniform(0, 0.13 * difficulty, SHAPE)
+    """Every pillar's height uniform in [0, 0.18 m] (paper figure 3b)."""
+    return rng.uniform(0, 0.18 * difficulty, SHAPE)
 
 
 def holes(rng, difficulty):
@@ -336,16 +337,16 @@ def obstacles(rng, difficulty):
 
 
 def stairs(rng, difficulty):
-    """Flights up and down, 3 to 7 steps of up to 0.12 m, treads of 0.4 or 0.6 m."""
+    """Flights up and down, 3 to 7 steps of up to 0.18 m, treads of 0.4 or 0.6 m."""
     n = rng.integers(3, 8)
     flight = np.r_[np.arange(n), [n] * rng.integers(2, 5), np.arange(n)[::-1], [0] * 2]
     tread = rng.choice([0.4, 0.4, 0.6])
-    return 0.12 * difficulty * np.resize(flight, 99)[(U / tread + 1e-6).astype(int)]
+    return 0.18 * difficulty * np.resize(flight, 99)[(U / tread + 1e-6).astype(int)]
 
 
 def stones(rng, difficulty):
-    """Stepping stones 1 m down to 0.4 m wide, 0.2 m apart in brick bond, over a pit to 0.8 m."""
-    k = 2 + round(3 * (1 - difficulty)) + 1
+    """Stepping stones 1 m down to 0.6 m wide, 0.2 m apart in brick bond, over a pit to 0.8 m."""
+    k = 4 + round(2 * (1 - difficulty))
     i, j = np.indices(SHAPE)
     course = (i + rng.integers(k)) // k
     pit = ((i + rng.integers(k)) % k == 0) | ((j + rng.integers(0, k, 99)[course]) % k == 0)
@@ -354,26 +355,26 @@ def stones(rng, difficulty):
 
 
 def slopes(rng, difficulty):
-    """A hill or a valley across the way, up and down at up to 27 degrees, to 1.5 m high."""
+    """A hill or a valley across the way, up and down at up to 38 degrees, to 2.3 m high."""
     up, down = rng.uniform(1.5, 3.0, 2)
-    top = np.tan(np.radians(27 * difficulty * rng.uniform(0.7, 1))) * min(up, down)
+    top = np.tan(np.radians(38 * difficulty * rng.uniform(0.7, 1))) * min(up, down)
     a, b = np.sort(rng.uniform(up, SPAN - down, 2))
     return rng.choice([-1, 1]) * np.interp(U, [a - up, a, b, b + down], [0, top, top, 0])
 
 
 def side_slope(rng, difficulty):
-    """Ground that tips to one side, up to 20 degrees."""
-    tip = rng.choice([-1, 1]) * np.tan(np.radians(20 * difficulty * rng.uniform(0.6, 1)))
+    """Ground that tips to one side, up to 30 degrees."""
+    tip = rng.choice([-1, 1]) * np.tan(np.radians(30 * difficulty * rng.uniform(0.6, 1)))
     return tip * Y * _taper(3.0)
 
 
 def pyramids_up(rng, difficulty):
-    """Stepped pyramids of 3 to 6 steps of up to 0.12 m, treads of 0.4 m."""
+    """Stepped pyramids of 3 to 6 steps of up to 0.18 m, treads of 0.4 m."""
     level = np.zeros(SHAPE)
     for x, y in zip(rng.uniform(3, 9, 7), rng.uniform(-4, 4, 7), strict=True):
         ring = np.maximum(np.abs(X - x), np.abs(Y - y)) / 0.4
         level = np.maximum(level, np.floor(np.clip(rng.integers(3, 7) - ring, 0, None)))
-    return 0.12 * difficulty * np.minimum(level, np.floor(np.minimum(U, SPAN - U) / 0.4 + 1e-6))
+    return 0.18 * difficulty * np.minimum(level, np.floor(np.minimum(U, SPAN - U) / 0.4 + 1e-6))
 
 
 def pyramids_down(rng, difficulty):
@@ -387,8 +388,8 @@ def gaps(rng, difficulty):
 
 
 def hurdles(rng, difficulty):
-    """Up to 8 bars across, 0.2 m thick and up to 0.12 m high."""
-    return np.where(_bars(rng, 2 + 6 * difficulty), 0.12 * difficulty, 0.0)
+    """Up to 8 bars across, 0.2 m thick and up to 0.2 m high."""
+    return np.where(_bars(rng, 2 + 6 * difficulty), 0.2 * difficulty, 0.0)
 
 
 def ridges(rng, difficulty):
@@ -427,7 +428,7 @@ def walls(rng, difficulty):
 
 
 def rooms(rng, difficulty):
-    """Rooms of 2.2-3.2 m, a door of 0.8-1.6 m in up to every wall between two of them."""
+    """Rooms of 2.2-3.2 m with doors of 0.8-1.6 m in most walls, and up to 15 things in them."""
     h = np.zeros(SHAPE)
     rows = np.arange(PAD + 1, SHAPE[0] - PAD, rng.integers(12, 17))
     columns = np.arange(rng.integers(4, 12), SHAPE[1] - 3, rng.integers(12, 17))
@@ -441,7 +442,7 @@ def rooms(rng, difficulty):
                 if b - a > 5 and rng.random() < 1 - 0.2 * difficulty:
                     at = rng.integers(a + 1, max(b - door, a + 1) + 1)
                     view[line, at : min(at + door, b)] = 0
-    return h
+    return np.maximum(h, _boxes(rng, 15 * difficulty, (1, 4), (0.3, 1.2)))
 
 
 def mazes(rng, difficulty):
@@ -451,7 +452,7 @@ def mazes(rng, difficulty):
     h = np.zeros(SHAPE)
     for i in x:
         for j in y:
-            tall = _wall(difficulty) * (rng.random(2) < 0.6)
+            tall = _wall(difficulty) * (rng.random(2) < 0.2 + 0.4 * difficulty)
             h[i : i + pitch + 1, j] = np.maximum(h[i : i + pitch + 1, j], tall[0])
             h[i, j : j + pitch + 1] = np.maximum(h[i, j : j + pitch + 1], tall[1])
     h[-PAD:] = 0
@@ -492,37 +493,25 @@ def coasts(rng, difficulty):
 
 
 def crags(rng, difficulty):
-    """Hills 4 m long with slopes to about 27 degrees, bumps of 4 cm and up to 25 boulders."""
+    """Hills 4 m long with slopes to about 35 degrees, bumps of 6 cm and up to 25 boulders."""
     hills = _noise(rng, SHAPE, (4, 3))
     slope = np.percentile(np.hypot(*np.gradient(hills, L)), 90)
-    ground = hills * np.tan(np.radians(27 * difficulty)) / slope * _taper(2.5)
-    bumps = rng.uniform(0, 0.04 * difficulty, SHAPE)
+    ground = hills * np.tan(np.radians(35 * difficulty)) / slope * _taper(2.5)
+    bumps = rng.uniform(0, 0.06 * difficulty, SHAPE)
     return ground + bumps + _boxes(rng, 25 * difficulty, (1, 3), (0.05, 0.4))
 
 
 def blocks(rng, difficulty):
-    """Up to 60 low boxes and steps of 0.03-0.12 m to tread on, and 15 tall ones to avoid."""
-    low = _boxes(rng, 60 * difficulty, (2, 6), (0.03, 0.12))
+    """Up to 60 low boxes and steps of 0.03-0.2 m to tread on, and 15 tall ones to avoid."""
+    low = _boxes(rng, 60 * difficulty, (2, 6), (0.03, 0.2))
     return np.maximum(low, _boxes(rng, 15 * difficulty, (1, 3), (0.4, 1.0)))
 
 
-def poles(rng, difficulty):
-    """Up to 20 trunks of 0.2-0.4 m on ground with bumps to 0.05 m."""
-    bumps = rng.uniform(0, 0.05 * difficulty, SHAPE)
-    return np.maximum(bumps, _boxes(rng, 20 * difficulty, (1, 2), (1.0, 1.6)))
-
-
 def waves(rng, difficulty):
-    """Sine waves along and across, 2.5-4 m long, slopes to about 20 degrees."""
+    """Sine waves along and across, 2.5-4 m long, slopes to about 31 degrees."""
     k, phase = 2 * np.pi / rng.uniform(2.5, 4, 2), rng.uniform(0, 2 * np.pi, 2)
     swell = np.sin(k[0] * X + phase[0]) / k[0] + 0.7 * np.sin(k[1] * Y + phase[1]) / k[1]
-    return 0.35 * difficulty * swell * _taper(1.6)
-
-
-def fractal(rng, difficulty):
-    """Hills of three octaves, 3 m long and 0.3 m high, then halved twice."""
-    hills = sum(_noise(rng, SHAPE, (4 * 2**k + 1, 3 * 2**k + 1)) / 2**k for k in range(3))
-    return 0.3 * difficulty * hills * _taper(1.6)
+    return 0.6 * difficulty * swell * _taper(1.6)
 
 
 PILLAR_TASKS = {
@@ -530,7 +519,7 @@ PILLAR_TASKS = {
     for task in (
         flat, rugged, holes, obstacles, stairs, stones, slopes, side_slope, pyramids_up,
         pyramids_down, gaps, hurdles, ridges, pits, coasts, corridors, walls, rooms, mazes,
-        screens, traps, blocks, poles, waves, fractal, crags,
+        screens, traps, blocks, waves, crags,
     )
 }
 
@@ -561,7 +550,7 @@ def make_terrain(task, rng, difficulty):
         length = ground.size[0]
         # From either end, and from wherever else a robot can stand: in a maze, on a ridge.
         zones = (1.0, PAD * L), (length - PAD * L, length - 1.0), (0.0, length)
-        routes = _routes(ground, rng, ROUTES, (min(6, length / 2), 9), zones=zones, margin=1.0)
+        routes = _routes(ground, rng, ROUTES, (min(6, length / 2), 9), STEP, zones, margin=1.0)
         if routes:
             mesh = fuse_pillars(heights, L, W)
             return Terrain(name, *mesh, *routes, ground)

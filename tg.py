@@ -93,7 +93,8 @@ PARAMETERS = {
     "swing_height": (0.26, 0.10),  # m, lift of the feet in mid-swing; soft legs reach 0.14-0.18 m
     "stance_height": (0.25, 0.07),  # m, hips above the feet
 }
-CENTRE, RANGE = np.array(list(PARAMETERS.values())).T
+_LIMITS = tuple(PARAMETERS.values())
+CENTRE, RANGE = np.array(_LIMITS).T
 PHASE_OFFSET = (0.0, math.pi, math.pi, 0.0)  # trot: diagonal legs move together
 DUTY = 0.5  # share of a stride that a foot stands: two feet are down at any time
 OUTWARD = 0.12  # m that feet stand outside their leg plane: a wide stance is what survives pushes
@@ -110,7 +111,7 @@ class TrajectoryGenerator:
 
     Attributes:
         phase: common phase, rad in [0, 2 pi).
-        parameters: (5,) the values of PARAMETERS in force, and scaled: the same in [-1, 1].
+        parameters: the 5 values of PARAMETERS in force, a list; scaled: the same in [-1, 1].
     """
 
     action_size = len(PARAMETERS)
@@ -122,7 +123,7 @@ class TrajectoryGenerator:
     def reset(self, phase=0.0):
         """Starts the stride at `phase` (rad) with the parameters of the zero action."""
         self.phase = float(phase) % (2 * np.pi)
-        self.scaled, self.parameters = np.zeros(CENTRE.size), CENTRE.copy()
+        self.scaled, self.parameters = [0.0] * len(PARAMETERS), CENTRE.tolist()
 
     def step(self, action, dt):
         """Advances the phase by `dt` seconds under new parameters.
@@ -136,12 +137,11 @@ class TrajectoryGenerator:
             ValueError: if `action` has another shape or is not finite.
         """
         action = np.asarray(action, dtype=np.float64)
-        if action.shape != CENTRE.shape or not math.isfinite(action.sum()):
+        if action.shape != CENTRE.shape or not math.isfinite(sum(values := action.tolist())):
             raise ValueError(f"action must be {CENTRE.size} finite numbers, got {action}")
-        self.scaled = np.minimum(np.maximum(action, -1.0), 1.0)
-        self.parameters = CENTRE + RANGE * self.scaled
-        advance = 2 * math.pi * float(self.parameters[0]) * dt
-        self.phase = (self.phase + advance) % (2 * math.pi)
+        self.scaled = [min(max(value, -1.0), 1.0) for value in values]
+        self.parameters = [c + r * s for (c, r), s in zip(_LIMITS, self.scaled, strict=True)]
+        self.phase = (self.phase + 2 * math.pi * self.parameters[0] * dt) % (2 * math.pi)
         return np.array([_leg_angles(k, *foot) for k, foot in enumerate(self._feet())]).ravel()
 
     def feet(self):
@@ -149,7 +149,7 @@ class TrajectoryGenerator:
         return np.array(self._feet())
 
     def _feet(self):
-        _, left, right, lift, height = self.parameters.tolist()
+        _, left, right, lift, height = self.parameters
         feet = []
         for offset, stride, lateral, side in zip(
             PHASE_OFFSET, (right, left, right, left), _LATERAL, _SIDE, strict=True
@@ -166,4 +166,4 @@ class TrajectoryGenerator:
     def state(self):
         """s_tg, a list of 13: cosine and sine of each leg's phase, then `scaled`."""
         phases = [self.phase + offset for offset in PHASE_OFFSET]
-        return [*map(math.cos, phases), *map(math.sin, phases), *self.scaled.tolist()]
+        return [*map(math.cos, phases), *map(math.sin, phases), *self.scaled]

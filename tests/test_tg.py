@@ -131,7 +131,7 @@ def test_feet_move_without_jumps(action, phase):
 def test_parameters_stay_in_their_limits(action):
     generator = tg.TrajectoryGenerator()
     generator.step(action, 0.03)
-    assert (np.abs(generator.parameters - tg.CENTRE) <= tg.RANGE + 1e-12).all()
+    assert (np.abs(np.subtract(generator.parameters, tg.CENTRE)) <= tg.RANGE + 1e-12).all()
     assert np.abs(generator.state()).max() <= 1 + 1e-9
     assert len(generator.state()) == generator.state_size
 
