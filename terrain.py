@@ -734,9 +734,9 @@ def cliff(rng):
 
 
 def continuous(rng):
-    """A smooth random surface of triangles, 5 % of it steeper than 20 degrees: 13 x 10 m."""
+    """A smooth random surface of triangles, 5 % of it steeper than 24 degrees: 13 x 10 m."""
     cell = 0.25
-    nodes = _smooth(rng, (13.0, 10.0), cell, (4, 3), 2, 20)
+    nodes = _smooth(rng, (13.0, 10.0), cell, (4, 3), 2, 24)
     plan = _plan_of(nodes, cell, (130, 100))
     return _world("continuous", rng, plan, triangulate(nodes, (cell, cell)), CLIMB)
 
