@@ -19,6 +19,7 @@ import sys
 import tempfile
 import time
 import xml.etree.ElementTree as ET
+from numbers import Real
 from pathlib import Path
 
 import gymnasium
@@ -130,6 +131,7 @@ def lidar_directions():
 # ------------------------------------------------------------------------------- the environment
 
 SUBSTEPS, DT = 5, 1 / 30  # physics steps in a control step, and its length in s
+GRAVITY = 9.81  # m/s2
 MAX_TORQUE = 40.0  # Nm
 # Bullet's implicit PD, per physics step. Compliant on purpose: of 1,500 random gaits on rugged
 # ground those with a position gain of 0.25 stayed up a third as long.
@@ -193,6 +195,8 @@ class LocoEnv(gymnasium.Env):
         tg, lidar: the paper's ablations (section 3) leave one of them out.
         terrains: how many terrains of each task to build; Bullet never frees a mesh, so the pool
             is built once and episodes draw from it. A finished Terrain counts once.
+        tilt: degrees by which an episode tips the whole ground at most, in any direction; most tip
+            it little. Gravity turns instead. Pillars have level tops: so they become smooth slopes.
         pool_seed: seeds the pool; `reset(seed=...)` seeds all else.
         render_mode: None or "rgb_array".
         gui: open PyBullet's window; it allows one in a process.
@@ -203,16 +207,18 @@ class LocoEnv(gymnasium.Env):
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": round(1 / DT)}
 
-    def __init__(self, tasks=None, difficulty=(0.0, 1.0), tg=True, lidar=True, terrains=1,
+    def __init__(self, tasks=None, difficulty=(0.0, 1.0), tg=True, lidar=True, terrains=1, tilt=0.0,
                  pool_seed=0, render_mode=None, gui=False):
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
-        low, high = np.broadcast_to(difficulty, 2)
-        if not 0 <= low <= high <= 1:
+        low, high = difficulty if np.size(difficulty) == 2 else (difficulty, difficulty)
+        if not all(isinstance(d, Real) for d in (low, high)) or not 0 <= low <= high <= 1:
             raise ValueError(f"difficulty must be in [0, 1] or (low, high), got {difficulty}")
-        if terrains < 1:
-            raise ValueError(f"terrains must be at least 1, got {terrains}")
-        self.render_mode, self.show_lidar = render_mode, False
+        if not isinstance(terrains, int) or terrains < 1:
+            raise ValueError(f"terrains must be a whole number of at least 1, got {terrains!r}")
+        if not isinstance(tilt, Real) or not 0 <= tilt <= 45:
+            raise ValueError(f"tilt must be in [0, 45] degrees, got {tilt!r}")
+        self.render_mode, self.show_lidar, self.tilt = render_mode, False, math.radians(tilt)
         tasks = list(PILLAR_TASKS) if tasks is None else tasks
         tasks = tasks if isinstance(tasks, (list, tuple)) else [tasks]
         if not tasks:
@@ -242,7 +248,7 @@ class LocoEnv(gymnasium.Env):
             p.configureDebugVisualizer(p.COV_ENABLE_GUI, 0)
         for name in HOT:  # BulletClient looks a function up anew for each call, which costs 3 us
             setattr(p, name, getattr(p, name))
-        p.setGravity(0, 0, -9.81)
+        p.setGravity(0, 0, -GRAVITY)
         p.setPhysicsEngineParameter(fixedTimeStep=DT, numSubSteps=SUBSTEPS, numSolverIterations=20,
                                     enableConeFriction=0)
         # Side by side, farther apart than the LiDAR reaches: a reset only moves the robot.
@@ -329,6 +335,10 @@ class LocoEnv(gymnasium.Env):
         if self.generator:
             self.generator.reset(rng.uniform(0, 2 * np.pi))
             self.target = self.generator.step(np.zeros(self.generator.action_size), 0.0)
+        if self.tilt:
+            tip, way = self.tilt * rng.uniform() ** 2, rng.uniform(0, 2 * math.pi)
+            level = GRAVITY * math.sin(tip)
+            p.setGravity(level * math.cos(way), level * math.sin(way), -GRAVITY * math.cos(tip))
         self.action = np.zeros(self.action_space.shape)
         position = self.origin + [x, y, z + BASE_HEIGHT + 0.02]
         p.resetBasePositionAndOrientation(self.robot, position, _about_z(yaw))
@@ -478,13 +488,13 @@ if "LocoMTRL-v0" not in gymnasium.registry:  # run as a script, this file is imp
 REWARD_SCALE = 0.1  # keeps the critic's targets near 1; the environment's own reward is the paper's
 MAIN_STEPS = 2_500_000  # of the no-argument run
 # Short rollouts learn fastest at first; later the noise of so few samples holds the policy back.
-SHORT, LONG, SHORT_UNTIL = 256, 512, 400_000
-# A policy is judged without the noise, which has freed it wherever it was stuck: so the last part
-# of the training has little of it.
-QUIET, QUIET_STD = 0.2, 0.2
-# Standard deviation of the exploration noise: large on the two strides, for a way around must be
-# steered for a second before it pays; small on all else, or the noise throws the robot over.
-INIT_STD = np.array([0.37, 0.8, 0.8, 0.37, 0.37] + [0.37] * 12)
+# And a policy is judged without the exploration noise, which has freed it wherever it was stuck: so
+# the last part of the training has little of it.
+SHORT_UNTIL = 400_000  # steps
+QUIET_FROM, QUIET_STD = 0.6, 0.2  # share of all steps, largest standard deviation from there on
+# That deviation at first: large on the two strides, for a way around must be steered for a second
+# before it pays; small on all else, or the noise throws the robot over.
+INIT_STD = np.array([0.37, 0.6, 0.6, 0.37, 0.37] + [0.25] * 12)
 
 
 def training_env(index, seed, **options):
@@ -502,37 +512,41 @@ def train(args):
             load_checkpoint(run_dir / "checkpoint.pt")  # a bad one is better named by one process
         return launch(args)
     options = {"tg": args.tg, "lidar": args.lidar}
-    meta = {**options, "tasks": args.tasks, "sequential": args.sequential, "seed": args.seed,
+    meta = {**options, "tasks": args.tasks, "sequential": args.sequential, "tilt": args.tilt,
+            "seed": args.seed,
             "command": "python loco_mtrl.py " + " ".join(args.argv), "commit": _commit()}
-    # Each stage resumes the one before: tasks, steps at its end, steps of a rollout, largest std.
-    if args.sequential:  # one task after the other (section 3)
+    # Tasks, share of all steps done at the end, steps of a rollout, largest std of the noise.
+    if args.sequential:  # one task after the other (section 3), each for as long
         n = len(args.tasks)
-        stages = [([t], args.steps * (k + 1) // n, SHORT, 1) for k, t in enumerate(args.tasks)]
+        stages = [([task], (k + 1) / n, 256, 1.0) for k, task in enumerate(args.tasks)]
     else:
-        loud = round((1 - QUIET) * args.steps)
-        stages = [(args.tasks, min(SHORT_UNTIL, loud), SHORT, 1), (args.tasks, loud, LONG, 1),
-                  (args.tasks, args.steps, LONG, QUIET_STD)]
+        stages = [(args.tasks, min(SHORT_UNTIL / args.steps, QUIET_FROM), 256, 1.0),
+                  (args.tasks, QUIET_FROM, 512, 1.0), (args.tasks, 1.0, 1024, QUIET_STD)]
     with contextlib.closing(LocoEnv("flat", **options)) as env:
         mirror = env.mirror()
     scan = (len(LIDAR_ELEVATIONS), len(LIDAR_AZIMUTHS)) if args.lidar else (0, 0)
-    resume, on_update = args.resume, tensorboard(run_dir) if args.tensorboard else None
+    restarted = os.environ.get("TORCHELASTIC_RESTART_COUNT", "0") != "0"  # torchrun, after a crash
+    resume, on_update = args.resume or restarted, tensorboard(run_dir) if args.tensorboard else None
     try:
-        for tasks, total_timesteps, num_steps, max_std in stages:
+        for tasks, share, num_steps, max_std in stages:  # each resumes the one before
             config = PPOConfig(
-                total_timesteps=total_timesteps, num_envs=10, num_steps=num_steps,
-                num_minibatches=num_steps // 50, seed=args.seed, exteroceptive=scan,
+                total_timesteps=round(share * args.steps), num_envs=10, num_steps=num_steps,
+                num_minibatches=num_steps // 50, update_epochs=3, seed=args.seed,
+                checkpoint_every=10_000 // num_steps,
+                exteroceptive=scan, encoder_hidden=(128, 128), trunk_hidden=(128, 128),
                 gamma=0.998,  # a detour pays after seconds: 500 steps are 17 s
                 learning_rate=5e-4, target_kl=0.015,
                 init_std=tuple(INIT_STD[-len(mirror[2]) :].tolist()), max_std=max_std,
             )
-            make_env = functools.partial(training_env, seed=args.seed, tasks=tasks, **options)
+            make_env = functools.partial(training_env, seed=args.seed, tasks=tasks, tilt=args.tilt,
+                                         **options)
             learn(make_env, config, run_dir=run_dir, resume=resume, mirror=mirror, meta=meta,
                   episode_keys=("t_cr", "success", "fall", "exploded"), groups=args.tasks,
                   on_update=on_update)
             resume = True
     except KeyboardInterrupt:
         if int(os.environ.get("RANK", 0)) == 0:
-            print(f"\nStopped and saved. To go on: {_again(args)}")
+            print(f"\nStopped. To go on from the last checkpoint: {_again(args)}")
         return 130
     if int(os.environ.get("RANK", 0)) == 0:
         checkpoint = load_checkpoint(run_dir / "checkpoint.pt")
@@ -622,7 +636,7 @@ def walk_straight(observation, env):
     """Walks straight at the goal on the same trajectory generator: steers, but sees nothing."""
     action = np.zeros(env.action_space.shape)
     heading = observation[env.unwrapped.n_rays + 1]
-    action[1:3] = 0.4 + np.clip(heading, -0.6, 0.6) * np.array([-1, 1])  # left, right stride
+    action[1:3] = 0.27 + np.clip(heading, -0.6, 0.6) * np.array([-0.67, 0.67])  # two strides
     return action
 
 
@@ -866,6 +880,8 @@ def parse(argv):
     p.add_argument("--steps", type=_count, default=MAIN_STEPS, help="of the environment, in all")
     p.add_argument("--tasks", type=_names(PILLAR_TASKS, "task"), default=list(PILLAR_TASKS),
                    help="comma-separated; default: all %(default)s")
+    p.add_argument("--tilt", type=float, default=28, help="most degrees by which an episode tips the "
+                   "ground, for smooth slopes; 0: as in the paper (default %(default)s)")
     p.add_argument("--no-tg", dest="tg", action="store_false", help="reactive policy")
     p.add_argument("--no-lidar", dest="lidar", action="store_false", help="blind policy")
     p.add_argument("--sequential", action="store_true", help="one task after the other, not mixed")

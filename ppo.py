@@ -84,9 +84,15 @@ class PPOConfig:
 
 
 def sum_over_ranks(tensor):
-    """Sum `tensor` over all ranks, in place; every rank gets the same bits. Returns it."""
+    """Sum `tensor` over all ranks, in place; every rank gets the same bits. Returns it.
+
+    Raises ConnectionError if a rank is gone.
+    """
     if dist.is_initialized():
-        dist.all_reduce(tensor)
+        try:
+            dist.all_reduce(tensor)
+        except RuntimeError as error:  # gloo's own words are about sockets
+            raise ConnectionError("another rank was lost: this one ends, too") from error
     return tensor
 
 
@@ -151,9 +157,12 @@ class ActorCritic(nn.Module):
         init_std: standard deviation of the exploration noise, the same in every state: a number,
             or one for each entry of the action.
         mirror: None, or (obs_index, obs_sign, act_index, act_sign): the left-right mirror image of
-            an observation o is `o[obs_index] * obs_sign`, and likewise for an action. The policy
-            is then equivariant by construction, mean(mirror(o)) = mirror(mean(o)), and the value
-            invariant. (Mirrored samples as more data would be off-policy: their ratios run away.)
+            an observation o is `o[obs_index] * obs_sign`, and likewise for an action. The networks
+            then see both o, with 1 appended, and its image, with -1, and their outputs are
+            averaged: without that number the policy would be equivariant by construction,
+            mean(mirror(o)) = mirror(mean(o)), and before a wall that is as wide on the left as on
+            the right stand for ever; with it, it learns once for both sides and may prefer one.
+            (Mirrored samples as more data would be off-policy: their ratios run away.)
 
     Raises ValueError if the scan exceeds the observation, the mirror is not its own inverse, or
     init_std has another length than the action.
@@ -181,8 +190,9 @@ class ActorCritic(nn.Module):
         self.kwargs = {"obs_dim": obs_dim, "act_dim": act_dim, "exteroceptive": list(exteroceptive),
                        "encoder_hidden": list(encoder_hidden), "trunk_hidden": list(trunk_hidden),
                        "init_std": std.tolist(), "mirror": mirror}
-        self.actor = TwoEncoders(obs_dim, act_dim, exteroceptive, encoder_hidden, trunk_hidden)
-        self.critic = TwoEncoders(obs_dim, 1, exteroceptive, encoder_hidden, trunk_hidden)
+        n_in = obs_dim + (mirror is not None)
+        self.actor = TwoEncoders(n_in, act_dim, exteroceptive, encoder_hidden, trunk_hidden)
+        self.critic = TwoEncoders(n_in, 1, exteroceptive, encoder_hidden, trunk_hidden)
         with torch.no_grad():  # the first policy is the zero action plus noise, in every state
             self.actor.head.weight.mul_(0.01)
             self.actor.head.bias.zero_()
@@ -193,13 +203,20 @@ class ActorCritic(nn.Module):
         self.register_buffer("obs_sum_sq", torch.zeros(obs_dim, dtype=torch.float64))
 
     def views(self, obs):
-        """Normalised observations: (..., obs) -> (V, ..., obs); V = 2 with the mirror image."""
+        """What the networks see: normalised observations, (..., obs) -> (1, ..., obs).
+
+        Or (2, ..., obs + 1) with the mirror image, and the side in the last column.
+        """
         if self.count > 0:
             std = (self.obs_sum_sq / self.count).sqrt()
             obs = (obs - self.obs_mean) / (std + 1e-6)  # an entry may be constant
         # Clipped: one absurd sensor value must not throw the network out of all it has seen.
         obs = obs.clamp(-10, 10).float()
-        return torch.stack((obs, flip(obs, *self.flip_obs)) if self.flip_obs else (obs,))
+        if not self.flip_obs:
+            return obs[None]
+        side = torch.ones_like(obs[..., :1])
+        image = flip(obs, *self.flip_obs)
+        return torch.stack((torch.cat((obs, side), -1), torch.cat((image, -side), -1)))
 
     def mean(self, obs):
         """Mean of the policy: (..., obs) -> (..., act)."""
@@ -472,7 +489,12 @@ def learn(make_env, config, *, run_dir=None, resume=False, mirror=None, init=Non
     """
     torch.set_num_threads(1)  # nets this small only lose by more
     if int(os.environ.get("WORLD_SIZE", 1)) > 1 and not dist.is_initialized():
-        dist.init_process_group("gloo")  # left open: a second learn() goes on with it
+        store, *place = next(dist.rendezvous("env://"))
+        # After a crash torchrun starts the ranks again, with the same store (--max-restarts): they
+        # must not find the addresses of the dead in it.
+        store = dist.PrefixStore(os.environ.get("TORCHELASTIC_RESTART_COUNT", "0"), store)
+        # Left open: a second learn() goes on with it.
+        dist.init_process_group("gloo", store=store, rank=place[0], world_size=place[1])
     rank, world = (dist.get_rank(), dist.get_world_size()) if dist.is_initialized() else (0, 1)
 
     opened = [None]

@@ -1,6 +1,7 @@
 """The environment: its senses against geometry, its reward and endings against the paper."""
 
 import dataclasses
+import math
 
 import gymnasium
 import numpy as np
@@ -272,6 +273,22 @@ def test_tasks_that_fail_get_six_times_the_seconds_of_those_that_succeed(monkeyp
     env.close()
 
 
+def test_tipped_ground_is_gravity_turned_within_its_limit():
+    env, tips = LocoEnv("flat", tilt=30), []
+    for seed in range(200):
+        env.reset(seed=seed)
+        engine = env.bullet.getPhysicsEngineParameters()
+        pull = np.array([engine[f"gravityAcceleration{axis}"] for axis in "XYZ"])
+        assert np.linalg.norm(pull) == pytest.approx(9.81)
+        tips.append((math.degrees(math.acos(-pull[2] / 9.81)), math.atan2(pull[1], pull[0])))
+    steep, way = np.array(tips).T
+    assert 25 < steep.max() <= 30 and np.median(steep) == pytest.approx(7.5, abs=3)  # 30 / 4
+    assert np.histogram(way, 4, (-np.pi, np.pi))[0].min() > 25
+    env.reset(seed=199)  # the same seed, the same ground
+    assert env.bullet.getPhysicsEngineParameters()["gravityAccelerationX"] == pytest.approx(pull[0])
+    env.close()
+
+
 def test_every_task_is_drawn_and_named():
     env = LocoEnv(["flat", "holes", wall_ahead])
     tasks = {env.reset(seed=s)[1]["task"] for s in range(30)}
@@ -339,7 +356,13 @@ def test_mirror_is_what_a_mirrored_robot_would_observe(flat):
         ({"difficulty": 2}, "2"),
         ({"difficulty": (0.5, 0.2)}, "0.5"),
         ({"difficulty": float("nan")}, "nan"),
+        ({"difficulty": "hard"}, "hard"),
         ({"terrains": 0}, "0"),
+        ({"terrains": 1.5}, "1.5"),
+        ({"tilt": "steep"}, "steep"),
+        ({"tilt": -1}, "-1"),
+        ({"tilt": 90}, "90"),
+        ({"tilt": float("nan")}, "nan"),
         ({"render_mode": "ascii"}, "ascii"),
     ],
 )

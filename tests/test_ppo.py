@@ -212,7 +212,7 @@ def test_actions_have_the_mean_and_the_std():
     assert noise.std(0).tolist() == pytest.approx([0.5, 0.5], abs=0.02)
 
 
-def test_mirror_is_exact():
+def test_mirror_is_exact_but_for_the_preferred_side():
     torch.manual_seed(0)
     plain, model = ActorCritic(4, 3, (1, 2)), ActorCritic(4, 3, (1, 2), mirror=MIRROR)
     data = torch.randn(500, 4) * torch.tensor([1.0, 5.0, 2.0, 0.1]) + 3
@@ -223,7 +223,12 @@ def test_mirror_is_exact():
     obs_index, obs_sign, act_index, act_sign = map(torch.tensor, MIRROR)
     obs = torch.randn(200, 4) * 4
     turned = obs[:, obs_index] * obs_sign
+    symmetric = obs + turned
     with torch.no_grad():
+        mean = model.mean(symmetric)
+        assert (mean - mean[:, act_index] * act_sign).abs().max() > 0.01  # it takes a side ...
+        for network in (model.actor, model.critic):
+            network.encoders[-1][0].weight[:, -1] = 0  # ... by the last entry of what it sees
         expected = model.mean(obs)[:, act_index] * act_sign
         torch.testing.assert_close(model.mean(turned), expected, rtol=1e-5, atol=1e-5)
         torch.testing.assert_close(model.value(turned), model.value(obs), rtol=1e-5, atol=1e-5)
@@ -325,6 +330,27 @@ def test_value_under_a_time_limit_is_that_of_an_endless_task():
     # Reward 1 for ever: V = 1 / (1 - gamma) = 5. Taking the limit for an end would give about 3.
     model = train(lambda: Probe(length=5, truncates=True, blind=True), 50, gamma=0.8)
     assert model.value(torch.zeros(2)).item() == pytest.approx(5, abs=0.3)
+
+
+def test_pendulum_swings_up():
+    def make(index):
+        env = gym.wrappers.RescaleAction(gym.make("Pendulum-v1"), np.float32(-1), np.float32(1))
+        return gym.wrappers.TransformReward(env, lambda reward: 0.1 * reward)
+
+    config = PPOConfig(
+        total_timesteps=80_000, num_envs=8, num_steps=256, gamma=0.95, update_epochs=10,
+        num_minibatches=16, learning_rate=1e-3, max_learning_rate=3e-3, critic_learning_rate=3e-3,
+        target_kl=0.02, init_std=0.6, encoder_hidden=(64,), trunk_hidden=(64,),
+    )
+    model = learn(make, config, episode_keys=())
+    returns, env = [], make(0)
+    for seed in range(20):
+        obs, _ = env.reset(seed=1000 + seed)
+        returns.append(0.0)
+        for _ in range(200):
+            obs, reward, *_ = env.step(model.mean_action(obs).clip(-1, 1))
+            returns[-1] += 10 * reward
+    assert np.mean(returns) > -200  # hanging gives about -1,400, random torque about -1,200
 
 
 def test_the_same_seed_gives_the_same_bits_and_another_does_not():
