@@ -362,12 +362,6 @@ def slopes(rng, difficulty):
     return rng.choice([-1, 1]) * np.interp(U, [a - up, a, b, b + down], [0, top, top, 0])
 
 
-def side_slope(rng, difficulty):
-    """Ground that tips to one side, up to 30 degrees."""
-    tip = rng.choice([-1, 1]) * np.tan(np.radians(30 * difficulty * rng.uniform(0.6, 1)))
-    return tip * Y * _taper(3.0)
-
-
 def pyramids_up(rng, difficulty):
     """Stepped pyramids of 3 to 6 steps of up to 0.18 m, treads of 0.4 m."""
     level = np.zeros(SHAPE)
@@ -396,7 +390,7 @@ def ridges(rng, difficulty):
     """Two winding paths, 2 m down to 0.8 m wide, over a drop of up to 1 m."""
     path = (U == 0) | (U == SPAN)
     for _ in range(2):
-        turn, phase, swing = rng.uniform(0.5, 0.9), rng.uniform(0, 6.3), rng.uniform(0.3, 1.2)
+        turn, phase, swing = rng.uniform(0.5, 1.2), rng.uniform(0, 6.3), rng.uniform(0.3, 1.5)
         middle = rng.uniform(-2, 2) + swing * np.sin(turn * X + phase)
         across = (2.0 - 1.2 * difficulty) * np.hypot(1, swing * turn * np.cos(turn * X + phase))
         path |= np.abs(Y - middle) <= across / 2
@@ -428,10 +422,10 @@ def walls(rng, difficulty):
 
 
 def rooms(rng, difficulty):
-    """Rooms of 2.2-3.2 m with doors of 0.8-1.6 m in most walls, and up to 15 things in them."""
+    """Rooms of 2.2-4.2 m with doors of 0.8-1.6 m in most walls, and up to 15 things in them."""
     h = np.zeros(SHAPE)
-    rows = np.arange(PAD + 1, SHAPE[0] - PAD, rng.integers(12, 17))
-    columns = np.arange(rng.integers(4, 12), SHAPE[1] - 3, rng.integers(12, 17))
+    rows = np.arange(PAD + 1, SHAPE[0] - PAD, rng.integers(12, 22))
+    columns = np.arange(rng.integers(4, 12), SHAPE[1] - 3, rng.integers(12, 22))
     h[rows], h[rows[0] : rows[-1], columns] = _wall(difficulty), _wall(difficulty)
     for lines, crossing, view in ((rows, columns, h), (columns, rows, h.T)):
         border = [0, view.shape[1]] if view is h else []
@@ -517,9 +511,9 @@ def waves(rng, difficulty):
 PILLAR_TASKS = {
     task.__name__: task
     for task in (
-        flat, rugged, holes, obstacles, stairs, stones, slopes, side_slope, pyramids_up,
-        pyramids_down, gaps, hurdles, ridges, pits, coasts, corridors, walls, rooms, mazes,
-        screens, traps, blocks, waves, crags,
+        flat, rugged, holes, obstacles, stairs, stones, slopes, pyramids_up, pyramids_down, gaps,
+        hurdles, ridges, pits, coasts, corridors, walls, rooms, mazes, screens, traps, blocks,
+        waves, crags,
     )
 }
 

@@ -32,6 +32,13 @@ def flat():
     env.close()
 
 
+@pytest.fixture(scope="module")
+def plane():
+    env = LocoEnv(lambda rng, difficulty: np.zeros((150, 150)))  # 30 x 30 m
+    yield env
+    env.close()
+
+
 def place(env, x, y, z, yaw=0.0, roll=0.0):
     """Puts the robot's base somewhere and takes an observation without any physics."""
     p = env.bullet
@@ -79,9 +86,9 @@ def test_imu_gives_rates_in_the_frame_of_the_base(flat):
 
 @settings(max_examples=20, deadline=None)
 @given(st.floats(0.2, 0.9), st.floats(-3, 3))
-def test_lidar_over_a_plane(flat, height, yaw):
-    flat.reset(seed=0)
-    scan = place(flat, 6.0, 0.0, height, yaw)[:N_RAYS]
+def test_lidar_over_a_plane(plane, height, yaw):
+    plane.reset(seed=0)
+    scan = place(plane, 15.0, 0.0, height, yaw)[:N_RAYS]
     with np.errstate(divide="ignore"):
         drop = -loco_mtrl.lidar_directions()[:, 2]
         expected = np.where(drop > 0, (height + LIDAR_POSITION[2]) / drop / LIDAR_RANGE, 1.0)
@@ -155,7 +162,7 @@ def test_lidar_never_sees_the_robot(flat):
 
 
 def test_reward_is_velocity_toward_the_goal_and_sums_to_the_progress():
-    env = LocoEnv("rugged", difficulty=0.5)
+    env = LocoEnv("rugged", difficulty=0.35)
     env.reset(seed=1)
     first, total = env.distance, 0.0
     for _ in range(120):
@@ -170,19 +177,17 @@ def test_reward_is_velocity_toward_the_goal_and_sums_to_the_progress():
     env.close()
 
 
-def test_zero_action_walks_by_itself():
+def test_zero_action_walks_by_itself(plane):
     """At least 0.3 m/s for 8 s on flat ground, from any phase of the stride."""
-    env = LocoEnv(lambda rng, difficulty: np.zeros((150, 150)))  # 30 x 30 m: nobody steers
     for seed in range(6):
-        env.reset(seed=seed)
-        start = np.array(env.position)
+        plane.reset(seed=seed)
+        start = np.array(plane.position)
         for _ in range(round(8 / DT)):
-            _, _, terminated, _, info = env.step(np.zeros(17))
+            _, _, terminated, _, info = plane.step(np.zeros(17))
             assert not info["fall"]
             if terminated:
                 break
-        assert np.hypot(*(np.array(env.position) - start)[:2]) / env.time >= 0.3
-    env.close()
+        assert np.hypot(*(np.array(plane.position) - start)[:2]) / plane.time >= 0.3
 
 
 def test_success_ends_the_episode_at_the_goal(flat):
@@ -282,7 +287,7 @@ def test_tipped_ground_is_gravity_turned_within_its_limit():
         assert np.linalg.norm(pull) == pytest.approx(9.81)
         tips.append((math.degrees(math.acos(-pull[2] / 9.81)), math.atan2(pull[1], pull[0])))
     steep, way = np.array(tips).T
-    assert 25 < steep.max() <= 30 and np.median(steep) == pytest.approx(7.5, abs=3)  # 30 / 4
+    assert 20 < steep.max() <= 30 and np.median(steep) == pytest.approx(3.75, abs=2)  # 30 / 8
     assert np.histogram(way, 4, (-np.pi, np.pi))[0].min() > 25
     env.reset(seed=199)  # the same seed, the same ground
     assert env.bullet.getPhysicsEngineParameters()["gravityAccelerationX"] == pytest.approx(pull[0])
