@@ -112,12 +112,11 @@ def _capsule(collision, end, radius):
 
 # ------------------------------------------------------------------------------- the senses
 
-LIDAR_RANGE = 5.0  # m
+LIDAR_RANGE = 3.0  # m
 LIDAR_POSITION = (0.36, 0.0, 0.08)  # m, ahead of the chassis: rays that start inside cost 70x
 # Degrees. Steep rays see the ground that the front feet are about to meet, level ones see walls.
 LIDAR_ELEVATIONS = (-84, -70, -57, -45, -34, -25, -17, -10, -3, 8)
-# Left to right, dense ahead. Those to the rear see what the hind feet will meet in a turn.
-LIDAR_AZIMUTHS = (150, 105, 70, 50, 35, 23, 13, 4, -4, -13, -23, -35, -50, -70, -105, -150)
+LIDAR_AZIMUTHS = np.linspace(85, -85, 16)  # left to right
 N_RAYS = len(LIDAR_ELEVATIONS) * len(LIDAR_AZIMUTHS)
 HIT_FRACTION = operator.itemgetter(2)  # of the range, in what rayTestBatch gives for a ray
 
@@ -163,7 +162,7 @@ class LocoEnv(gymnasium.Env):
     ## Observation: Box((202,), float32), in the order of section 2.1
     | entries | meaning | unit |
     |---|---|---|
-    | 160 | r, LiDAR scan: distance / 5 m, 1 = nothing hit; rows from low to high, left to right | |
+    | 160 | r, LiDAR scan: distance / 3 m, 1 = nothing hit; rows from low to high, left to right | |
     | 1 | g_d, distance to the goal | m |
     | 1 | g_h, heading of the goal relative to the robot's, left positive | rad |
     | 3 | angular rates of the base in its own frame (IMU) | rad/s |
@@ -196,8 +195,6 @@ class LocoEnv(gymnasium.Env):
         tg, lidar: the paper's ablations (section 3) leave one of them out.
         terrains: how many terrains of each task to build; Bullet never frees a mesh, so the pool
             is built once and episodes draw from it. A finished Terrain counts once.
-        tilt: degrees by which an episode tips the whole ground at most, in any direction; most tip
-            it little. Gravity turns instead. Pillars have level tops: so they become smooth slopes.
         pool_seed: seeds the pool; `reset(seed=...)` seeds all else.
         render_mode: None or "rgb_array".
         gui: open PyBullet's window; it allows one in a process.
@@ -208,7 +205,7 @@ class LocoEnv(gymnasium.Env):
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": round(1 / DT)}
 
-    def __init__(self, tasks=None, difficulty=(0.0, 1.0), tg=True, lidar=True, terrains=1, tilt=0.0,
+    def __init__(self, tasks=None, difficulty=(0.0, 1.0), tg=True, lidar=True, terrains=1,
                  pool_seed=0, render_mode=None, gui=False):
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
@@ -217,9 +214,7 @@ class LocoEnv(gymnasium.Env):
             raise ValueError(f"difficulty must be in [0, 1] or (low, high), got {difficulty}")
         if not isinstance(terrains, int) or terrains < 1:
             raise ValueError(f"terrains must be a whole number of at least 1, got {terrains!r}")
-        if not isinstance(tilt, Real) or not 0 <= tilt <= 45:
-            raise ValueError(f"tilt must be in [0, 45] degrees, got {tilt!r}")
-        self.render_mode, self.show_lidar, self.tilt = render_mode, False, math.radians(tilt)
+        self.render_mode, self.show_lidar = render_mode, False
         tasks = list(PILLAR_TASKS) if tasks is None else tasks
         tasks = tasks if isinstance(tasks, (list, tuple)) else [tasks]
         if not tasks:
@@ -249,7 +244,6 @@ class LocoEnv(gymnasium.Env):
             p.configureDebugVisualizer(p.COV_ENABLE_GUI, 0)
         for name in HOT:  # BulletClient looks a function up anew for each call, which costs 3 us
             setattr(p, name, getattr(p, name))
-        p.setGravity(0, 0, -GRAVITY)
         p.setPhysicsEngineParameter(fixedTimeStep=DT, numSubSteps=SUBSTEPS, numSolverIterations=20,
                                     enableConeFriction=0)
         # Side by side, farther apart than the LiDAR reaches: a reset only moves the robot.
@@ -338,10 +332,9 @@ class LocoEnv(gymnasium.Env):
         if self.generator:
             self.generator.reset(rng.uniform(0, 2 * np.pi))
             self.target = self.generator.step(np.zeros(self.generator.action_size), 0.0)
-        if self.tilt:
-            tip, way = self.tilt * rng.uniform() ** 3, rng.uniform(0, 2 * math.pi)
-            level = GRAVITY * math.sin(tip)
-            p.setGravity(level * math.cos(way), level * math.sin(way), -GRAVITY * math.cos(tip))
+        way, level = rng.uniform(0, 2 * math.pi), GRAVITY * math.sin(terrain.tilt)
+        down = -GRAVITY * math.cos(terrain.tilt)
+        p.setGravity(level * math.cos(way), level * math.sin(way), down)
         self.action = np.zeros(self.action_space.shape)
         position = self.origin + [x, y, z + BASE_HEIGHT + 0.02]
         p.resetBasePositionAndOrientation(self.robot, position, _about_z(yaw))
@@ -515,8 +508,7 @@ def train(args):
             load_checkpoint(run_dir / "checkpoint.pt")  # a bad one is better named by one process
         return launch(args)
     options = {"tg": args.tg, "lidar": args.lidar}
-    meta = {**options, "tasks": args.tasks, "sequential": args.sequential, "tilt": args.tilt,
-            "seed": args.seed,
+    meta = {**options, "tasks": args.tasks, "sequential": args.sequential, "seed": args.seed,
             "command": "python loco_mtrl.py " + " ".join(args.argv), "commit": _commit()}
     # Tasks, share of all steps done at the end, steps of a rollout, largest std of the noise.
     if args.sequential:  # one task after the other (section 3), each for as long
@@ -541,8 +533,7 @@ def train(args):
                 learning_rate=5e-4, target_kl=0.015,
                 init_std=tuple(INIT_STD[-len(mirror[2]) :].tolist()), max_std=max_std,
             )
-            make_env = functools.partial(training_env, seed=args.seed, tasks=tasks, tilt=args.tilt,
-                                         **options)
+            make_env = functools.partial(training_env, seed=args.seed, tasks=tasks, **options)
             learn(make_env, config, run_dir=run_dir, resume=resume, mirror=mirror, meta=meta,
                   episode_keys=("t_cr", "success", "fall", "exploded"), groups=args.tasks,
                   on_update=on_update)
@@ -883,8 +874,6 @@ def parse(argv):
     p.add_argument("--steps", type=_count, default=MAIN_STEPS, help="of the environment, in all")
     p.add_argument("--tasks", type=_names(PILLAR_TASKS, "task"), default=list(PILLAR_TASKS),
                    help="comma-separated; default: all %(default)s")
-    p.add_argument("--tilt", type=float, default=30, help="most degrees by which an episode tips "
-                   "the ground, for smooth slopes; 0: as in the paper (default %(default)s)")
     p.add_argument("--no-tg", dest="tg", action="store_false", help="reactive policy")
     p.add_argument("--no-lidar", dest="lidar", action="store_false", help="blind policy")
     p.add_argument("--sequential", action="store_true", help="one task after the other, not mixed")

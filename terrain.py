@@ -106,6 +106,7 @@ class Terrain:
     goals: np.ndarray  # (K, 3) x, y, ground z
     height: Callable  # height(x, y) -> ground z, arrays or scalars; -inf outside
     people: tuple[Person, ...] = ()
+    tilt: float = 0.0  # rad by which each episode tips the ground, some way: gravity turns instead
 
 
 # ---------------------------------------------------------------- meshes
@@ -362,6 +363,14 @@ def slopes(rng, difficulty):
     return rng.choice([-1, 1]) * np.interp(U, [a - up, a, b, b + down], [0, top, top, 0])
 
 
+def inclines(rng, difficulty):
+    """Smooth ground tipped by up to 30 degrees, whichever way, with up to 10 boulders."""
+    return _boxes(rng, 10 * difficulty, (1, 3), (0.05, 0.4))
+
+
+inclines.tilt = np.radians(30)  # at difficulty 1; pillars have level tops, and slopes do not
+
+
 def pyramids_up(rng, difficulty):
     """Stepped pyramids of 3 to 6 steps of up to 0.18 m, treads of 0.4 m."""
     level = np.zeros(SHAPE)
@@ -511,9 +520,9 @@ def waves(rng, difficulty):
 PILLAR_TASKS = {
     task.__name__: task
     for task in (
-        flat, rugged, holes, obstacles, stairs, stones, slopes, pyramids_up, pyramids_down, gaps,
-        hurdles, ridges, pits, coasts, corridors, walls, rooms, mazes, screens, traps, blocks,
-        waves, crags,
+        flat, rugged, holes, obstacles, stairs, stones, slopes, inclines, pyramids_up,
+        pyramids_down, gaps, hurdles, ridges, pits, coasts, corridors, walls, rooms, mazes,
+        screens, traps, blocks, waves, crags,
     )
 }
 
@@ -547,7 +556,8 @@ def make_terrain(task, rng, difficulty):
         routes = _routes(ground, rng, ROUTES, (min(6, length / 2), 9), STEP, zones, margin=1.0)
         if routes:
             mesh = fuse_pillars(heights, L, W)
-            return Terrain(name, *mesh, *routes, ground)
+            tilt = difficulty * getattr(generate, "tilt", 0.0)
+            return Terrain(name, *mesh, *routes, ground, tilt=tilt)
     raise ValueError(f"task {name!r} gave no walkable route in {TRIES} draws of {heights.shape}")
 
 

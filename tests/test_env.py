@@ -278,19 +278,17 @@ def test_tasks_that_fail_get_six_times_the_seconds_of_those_that_succeed(monkeyp
     env.close()
 
 
-def test_tipped_ground_is_gravity_turned_within_its_limit():
-    env, tips = LocoEnv("flat", tilt=30), []
-    for seed in range(200):
-        env.reset(seed=seed)
+def test_tipped_ground_is_gravity_turned():
+    env, ways = LocoEnv(["inclines", "flat"], difficulty=0.5), []
+    for seed in range(100):
+        env.reset(seed=seed, options={"terrain": seed % 2})
         engine = env.bullet.getPhysicsEngineParameters()
         pull = np.array([engine[f"gravityAcceleration{axis}"] for axis in "XYZ"])
         assert np.linalg.norm(pull) == pytest.approx(9.81)
-        tips.append((math.degrees(math.acos(-pull[2] / 9.81)), math.atan2(pull[1], pull[0])))
-    steep, way = np.array(tips).T
-    assert 20 < steep.max() <= 30 and np.median(steep) == pytest.approx(3.75, abs=2)  # 30 / 8
-    assert np.histogram(way, 4, (-np.pi, np.pi))[0].min() > 25
-    env.reset(seed=199)  # the same seed, the same ground
-    assert env.bullet.getPhysicsEngineParameters()["gravityAccelerationX"] == pytest.approx(pull[0])
+        tilt = 0.0 if seed % 2 else 15.0  # half of 30
+        assert math.degrees(math.acos(min(-pull[2] / 9.81, 1))) == pytest.approx(tilt, abs=1e-4)
+        ways.append(math.atan2(pull[1], pull[0]))
+    assert np.histogram(ways[::2], 4, (-np.pi, np.pi))[0].min() > 5  # every way
     env.close()
 
 
@@ -364,10 +362,6 @@ def test_mirror_is_what_a_mirrored_robot_would_observe(flat):
         ({"difficulty": "hard"}, "hard"),
         ({"terrains": 0}, "0"),
         ({"terrains": 1.5}, "1.5"),
-        ({"tilt": "steep"}, "steep"),
-        ({"tilt": -1}, "-1"),
-        ({"tilt": 90}, "90"),
-        ({"tilt": float("nan")}, "nan"),
         ({"render_mode": "ascii"}, "ascii"),
     ],
 )
