@@ -712,7 +712,9 @@ def evaluate(actors, places, n_episodes, workers):
 
 def eval_command(args):
     """`eval`: the table of the paper for one or more policies."""
-    rows = [load_actor(actor)[2] for actor in args.policies]  # bad files are named before any work
+    if args.json:  # bad files are named before any work
+        Path(args.json).touch()
+    rows = [load_actor(actor)[2] for actor in args.policies]
     places = args.worlds
     if args.mesh:
         places = [(args.mesh, args.scale, args.up)]
@@ -780,6 +782,8 @@ def play(args):
     act, options, _ = load_actor(args.policy)
     place = (args.mesh, args.scale, args.up) if args.mesh else args.world
     terrain = make_place(place, args.seed)
+    if not args.gui:
+        Path(args.gif).touch()
     options |= {"gui": True} if args.gui else {"render_mode": "rgb_array"}
     env = gymnasium.make("LocoMTRL-v0", tasks=terrain, disable_env_checker=True,
                          max_episode_steps=round(EVAL_SECONDS / DT), **options)
@@ -820,6 +824,7 @@ def play(args):
 
 def gallery(args):
     """`gallery`: every training task and every unseen world from above, in one picture."""
+    Path(args.out).touch()
     figure = _figure(figsize=(15, 11))
     names = [*PILLAR_TASKS, *WORLDS]
     axes = figure.subplots(-(-len(names) // 7), 7).ravel()
@@ -850,11 +855,15 @@ def _names(valid, what):
     return parse
 
 
-def _count(text):
-    value = int(float(text)) if text.replace(".", "").replace("e", "").isdigit() else 0
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"must be a whole number of at least 1, got {text!r}")
-    return value
+def _whole(least):
+    def parse(text):
+        value = float(text) if text.replace(".", "").replace("e", "").isdigit() else -1.0
+        if value < least or value % 1 != 0:
+            known = f"a whole number of at least {least}"
+            raise argparse.ArgumentTypeError(f"must be {known}, got {text!r}")
+        return int(value)
+
+    return parse
 
 
 def mesh_options(p):
@@ -870,17 +879,17 @@ def parse(argv):
     places = _names([*WORLDS, *PILLAR_TASKS], "world")
 
     p = commands.add_parser("train", help="train a policy")
-    p.add_argument("--steps", type=_count, default=MAIN_STEPS, help="of the environment, in all")
+    p.add_argument("--steps", type=_whole(1), default=MAIN_STEPS, help="of the environment, in all")
     p.add_argument("--tasks", type=_names(PILLAR_TASKS, "task"), default=list(PILLAR_TASKS),
                    help="comma-separated; default: all %(default)s")
     p.add_argument("--no-tg", dest="tg", action="store_false", help="reactive policy")
     p.add_argument("--no-lidar", dest="lidar", action="store_false", help="blind policy")
     p.add_argument("--sequential", action="store_true", help="one task after the other, not mixed")
-    p.add_argument("--seed", type=int, default=0)
+    p.add_argument("--seed", type=_whole(0), default=0)
     p.add_argument("--run-dir", default="runs/main", help="(default %(default)s)")
     p.add_argument("--resume", action="store_true", help="go on from the run's checkpoint")
     p.add_argument("--tensorboard", action="store_true", help="log for TensorBoard, too")
-    p.add_argument("--ranks", type=_count, default=cores, help="processes; default: every core")
+    p.add_argument("--ranks", type=_whole(1), default=cores, help="processes; default: every core")
     p.set_defaults(run=train)
 
     p = commands.add_parser("eval", help="score policies in worlds they never saw")
@@ -889,9 +898,9 @@ def parse(argv):
     p.add_argument("--worlds", type=places, default=list(WORLDS),
                    help="comma-separated worlds, or training tasks on held-out seeds")
     mesh_options(p)
-    p.add_argument("--episodes", type=_count, default=20, help="per world (default %(default)s)")
+    p.add_argument("--episodes", type=_whole(1), default=20, help="per world (default %(default)s)")
     p.add_argument("--json", metavar="FILE", help="write the scores there, too")
-    p.add_argument("--ranks", type=_count, default=cores, help="processes; default: every core")
+    p.add_argument("--ranks", type=_whole(1), default=cores, help="processes; default: every core")
     p.set_defaults(run=eval_command)
 
     p = commands.add_parser("play", help="watch a policy for one episode")
@@ -899,7 +908,7 @@ def parse(argv):
     p.add_argument("--world", type=lambda text: places(text)[0], default="maze",
                    help="a world or a training task (default %(default)s)")
     mesh_options(p)
-    p.add_argument("--seed", type=int, default=EVAL_SEED, help="layout (default %(default)s)")
+    p.add_argument("--seed", type=_whole(0), default=EVAL_SEED, help="layout (default %(default)s)")
     p.add_argument("--gif", metavar="FILE", default="play.gif", help="(default %(default)s)")
     p.add_argument("--lidar", action="store_true", help="draw where the LiDAR's rays hit")
     p.add_argument("--gui", action="store_true", help="PyBullet's window instead of a GIF")
@@ -907,7 +916,7 @@ def parse(argv):
 
     p = commands.add_parser("gallery", help="draw all terrains in one picture")
     p.add_argument("--out", metavar="FILE.png", default="gallery.png", help="(default %(default)s)")
-    p.add_argument("--seed", type=int, default=0)
+    p.add_argument("--seed", type=_whole(0), default=0)
     p.set_defaults(run=gallery)
 
     args = parser.parse_args(argv)

@@ -155,7 +155,9 @@ def test_play_writes_a_gif_that_moves_and_a_map(trained):
         (["train", "--steps", "nan"], "nan"),
         (["train", "--ranks", "0"], "0"),
         (["train", "--seed", "x"], "x"),
-        (["train", "--seed", "-1", "--ranks", "1"], "-1"),
+        (["train", "--seed", "-1"], "-1"),
+        (["train", "--seed", "1e999"], "1e999"),
+        (["train", "--steps", "2.5"], "2.5"),
         (["train", "--fast"], "--fast"),
         (["train", "--resume", "--run-dir", "nowhere"], "nowhere"),
         (["train", "--run-dir", "/proc/nowhere", "--ranks", "1"], "/proc/nowhere"),
@@ -167,6 +169,11 @@ def test_play_writes_a_gif_that_moves_and_a_map(trained):
         (["play", "zero", "--mesh", "nothing.obj"], "nothing.obj"),
         (["eval", "zero", "--mesh", "nothing.obj"], "nothing.obj"),
         (["eval", "zero", "--up", "x"], "'x'"),
+        (["eval", "zero", "--json", "/proc/nowhere/scores.json"], "/proc/nowhere"),
+        (["play", "zero", "--gif", "/proc/nowhere/walk.gif"], "/proc/nowhere"),
+        (["play", "zero", "--seed", "-3"], "-3"),
+        (["gallery", "--out", "/proc/nowhere/all.png"], "/proc/nowhere"),
+        (["gallery", "--seed", "0.5"], "0.5"),
     ],
 )
 def test_wrong_calls_end_with_one_clear_line(arguments, named, capsys):
