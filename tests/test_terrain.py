@@ -248,7 +248,7 @@ def test_walls_of_the_maze_and_its_corridors():
 
 
 def test_slopes_of_mountain_and_continuous():
-    for name, least, most in (("mountain", 24, 34), ("continuous", 16, 24)):
+    for name, least, most in (("mountain", 24, 34), ("continuous", 20, 28)):
         steep = []
         for seed in range(4):
             world = make_world(name, seed)
