@@ -488,8 +488,8 @@ MAIN_STEPS = 2_500_000  # of the no-argument run
 # the last part of the training has little of it.
 SHORT_UNTIL = 400_000  # steps
 QUIET_FROM, QUIET_STD = 0.7, 0.2  # share of all steps, largest standard deviation from there on
-# That deviation at first: large on the two strides, for a way around must be steered for a second
-# before it pays; small on all else, or the noise throws the robot over.
+# Standard deviation of that noise at first: large on the two strides, for a way around must be
+# steered for a second before it pays; small on all else, or the noise throws the robot over.
 INIT_STD = np.array([0.37, 0.6, 0.6, 0.37, 0.37] + [0.37] * 12)
 
 
@@ -783,7 +783,7 @@ def play(args):
     place = (args.mesh, args.scale, args.up) if args.mesh else args.world
     terrain = make_place(place, args.seed)
     if not args.gui:
-        Path(args.gif).touch()
+        Path(args.gif).touch()  # a place that cannot be written is named before the work
     options |= {"gui": True} if args.gui else {"render_mode": "rgb_array"}
     env = gymnasium.make("LocoMTRL-v0", tasks=terrain, disable_env_checker=True,
                          max_episode_steps=round(EVAL_SECONDS / DT), **options)
@@ -824,7 +824,7 @@ def play(args):
 
 def gallery(args):
     """`gallery`: every training task and every unseen world from above, in one picture."""
-    Path(args.out).touch()
+    Path(args.out).touch()  # as in play
     figure = _figure(figsize=(15, 11))
     names = [*PILLAR_TASKS, *WORLDS]
     axes = figure.subplots(-(-len(names) // 7), 7).ravel()

@@ -489,12 +489,12 @@ def learn(make_env, config, *, run_dir=None, resume=False, mirror=None, init=Non
     """
     torch.set_num_threads(1)  # nets this small only lose by more
     if int(os.environ.get("WORLD_SIZE", 1)) > 1 and not dist.is_initialized():
-        store, *place = next(dist.rendezvous("env://"))
+        store, rank, world = next(dist.rendezvous("env://"))
         # After a crash torchrun starts the ranks again, with the same store (--max-restarts): they
         # must not find the addresses of the dead in it.
         store = dist.PrefixStore(os.environ.get("TORCHELASTIC_RESTART_COUNT", "0"), store)
         # Left open: a second learn() goes on with it.
-        dist.init_process_group("gloo", store=store, rank=place[0], world_size=place[1])
+        dist.init_process_group("gloo", store=store, rank=rank, world_size=world)
     rank, world = (dist.get_rank(), dist.get_world_size()) if dist.is_initialized() else (0, 1)
 
     opened = [None]

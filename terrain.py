@@ -431,7 +431,7 @@ def walls(rng, difficulty):
 
 
 def rooms(rng, difficulty):
-    """Rooms of 2.2-4.2 m with doors of 0.8-1.6 m in most walls, and up to 15 things in them."""
+    """Rooms of 2.2-4.0 m with doors of 0.8-1.6 m in most walls, and up to 15 things in them."""
     h = np.zeros(SHAPE)
     rows = np.arange(PAD + 1, SHAPE[0] - PAD, rng.integers(12, 22))
     columns = np.arange(rng.integers(4, 12), SHAPE[1] - 3, rng.integers(12, 22))

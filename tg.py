@@ -93,8 +93,7 @@ PARAMETERS = {
     "swing_height": (0.26, 0.10),  # m, lift of the feet in mid-swing; soft legs reach 0.14-0.18 m
     "stance_height": (0.25, 0.07),  # m, hips above the feet
 }
-_LIMITS = tuple(PARAMETERS.values())
-CENTRE, RANGE = np.array(_LIMITS).T
+CENTRE, RANGE = np.array(list(PARAMETERS.values())).T
 PHASE_OFFSET = (0.0, math.pi, math.pi, 0.0)  # trot: diagonal legs move together
 DUTY = 0.5  # share of a stride that a foot stands: two feet are down at any time
 OUTWARD = 0.12  # m that feet stand outside their leg plane: a wide stance is what survives pushes
@@ -137,10 +136,12 @@ class TrajectoryGenerator:
             ValueError: if `action` has another shape or is not finite.
         """
         action = np.asarray(action, dtype=np.float64)
-        if action.shape != CENTRE.shape or not math.isfinite(sum(values := action.tolist())):
+        if action.shape != CENTRE.shape or not math.isfinite(sum(action.tolist())):
             raise ValueError(f"action must be {CENTRE.size} finite numbers, got {action}")
-        self.scaled = [min(max(value, -1.0), 1.0) for value in values]
-        self.parameters = [c + r * s for (c, r), s in zip(_LIMITS, self.scaled, strict=True)]
+        # Lists from here on: NumPy is slow on so few numbers.
+        self.scaled = [min(max(value, -1.0), 1.0) for value in action.tolist()]
+        pairs = zip(PARAMETERS.values(), self.scaled, strict=True)
+        self.parameters = [centre + half * scaled for (centre, half), scaled in pairs]
         self.phase = (self.phase + 2 * math.pi * self.parameters[0] * dt) % (2 * math.pi)
         return np.array([_leg_angles(k, *foot) for k, foot in enumerate(self._feet())]).ravel()
 

@@ -24,7 +24,7 @@ ROOT = Path(loco_mtrl.__file__).parent
 
 
 def train(folder, updates, resume=False, **options):
-    """A small training that saves after every update; 8 of 128 rows and more are resets."""
+    """A small training that saves after every update, of 4 x 32 rows with some resets in them."""
     config = ppo.PPOConfig(total_timesteps=updates * 120, checkpoint_every=1, **SMALL)
     env = lambda index: Probe(lambda obs, action, t: obs[0] * action, length=20)  # noqa: E731
     return ppo.learn(env, config, run_dir=folder, resume=resume, episode_keys=(), **options)
@@ -78,11 +78,17 @@ def run_of_two(tmp_path_factory):
     return folder
 
 
+@pytest.fixture(scope="module")
+def unbroken(tmp_path_factory):
+    """Parameters after four updates that nothing has stopped."""
+    return states(train(tmp_path_factory.mktemp("unbroken"), 4))
+
+
 MOMENTS = [*np.random.default_rng(0).uniform(0, 1, 17).round(3).tolist(), "fsync", "replace", "end"]
 
 
 @pytest.mark.parametrize("moment", MOMENTS)
-def test_killed_while_saving(moment, tmp_path, run_of_two, monkeypatch):
+def test_killed_while_saving(moment, tmp_path, run_of_two, unbroken, monkeypatch):
     for file in run_of_two.iterdir():
         (tmp_path / file.name).write_bytes(file.read_bytes())
     size = (tmp_path / "checkpoint.pt").stat().st_size
@@ -105,21 +111,11 @@ def test_killed_while_saving(moment, tmp_path, run_of_two, monkeypatch):
     counters = ppo.load_checkpoint(tmp_path / "checkpoint.pt")["counters"]
     assert counters["update"] == (3 if moment == "end" else 2)
     resumed = train(tmp_path, 4, resume=True)
-    assert same_bits(states(resumed), states(whole_run(tmp_path / "whole")))
-
-
-_whole = {}
-
-
-def whole_run(folder):
-    """What four updates give that nothing has stopped."""
-    if not _whole:
-        _whole["model"] = train(folder, 4)
-    return _whole["model"]
+    assert same_bits(states(resumed), unbroken)
 
 
 @pytest.mark.parametrize("full", ["checkpoint.pt.tmp", "progress.csv"])
-def test_a_full_disk_leaves_the_last_checkpoint(full, tmp_path):
+def test_a_full_disk_leaves_the_last_checkpoint(full, tmp_path, unbroken):
     train(tmp_path, 2)
     before = (tmp_path / "checkpoint.pt").read_bytes()
     if full == "progress.csv":
@@ -136,7 +132,7 @@ def test_a_full_disk_leaves_the_last_checkpoint(full, tmp_path):
             resource.setrlimit(resource.RLIMIT_FSIZE, limit)
     assert (tmp_path / "checkpoint.pt").read_bytes() == before
     (tmp_path / "checkpoint.pt.tmp").unlink(missing_ok=True)
-    assert same_bits(states(train(tmp_path, 4, resume=True)), states(whole_run(tmp_path / "whole")))
+    assert same_bits(states(train(tmp_path, 4, resume=True)), unbroken)
 
 
 def test_a_second_ctrl_c_stops_at_once_and_the_last_checkpoint_is_whole(tmp_path):
