@@ -113,19 +113,38 @@ def _capsule(collision, end, radius):
 # ------------------------------------------------------------------------------- the senses
 
 LIDAR_RANGE = 3.0  # m
-LIDAR_POSITION = (0.36, 0.0, 0.08)  # m, ahead of the chassis: rays that start inside cost 70x
+LIDAR_EVERY = 2  # control steps from one scan to the next: it turns at 15 Hz, as real ones do
+LIDAR_FRONT, LIDAR_REAR = (0.36, 0.0, 0.08), (-0.38, 0.0, 0.08)  # m, of the two sensors
 # Degrees. Steep rays see the ground that the front feet are about to meet, level ones see walls.
 LIDAR_ELEVATIONS = (-84, -70, -57, -45, -34, -25, -17, -10, -3, 8)
-LIDAR_AZIMUTHS = np.linspace(85, -85, 16)  # left to right
-N_RAYS = len(LIDAR_ELEVATIONS) * len(LIDAR_AZIMUTHS)
+# Columns on the left, from ahead to behind, densest ahead; and the first one on the right. Each row
+# is turned outwards by 0, 1 or 2 thirds of the way to the next column: together, three rows see
+# poles that would slip through one.
+_COLUMNS = (4, 12, 21, 31, 42, 54, 68, 84, 105, 130, 155, 175, 185)
+_LEFT = [np.interp(np.arange(12) + k % 3 / 3, np.arange(13), _COLUMNS) for k in range(10)]
+LIDAR_AZIMUTHS = np.array([[*left[::-1], *-left] for left in _LEFT])  # degrees, (rows, columns)
+N_RAYS = LIDAR_AZIMUTHS.size
 HIT_FRACTION = operator.itemgetter(2)  # of the range, in what rayTestBatch gives for a ray
 
 
-def lidar_directions():
-    """Unit vectors (N_RAYS, 3) in the base frame, row by row from the lowest, left to right."""
-    grid = np.meshgrid(LIDAR_ELEVATIONS, LIDAR_AZIMUTHS, indexing="ij")
-    up, left = np.radians(grid).reshape(2, -1)
-    return np.stack([np.cos(up) * np.cos(left), np.cos(up) * np.sin(left), np.sin(up)], axis=1)
+def lidar_rays():
+    """Where the rays start (m) and their unit vectors, (N_RAYS, 3) each in the base frame.
+
+    Row by row from the lowest, left to right. They start ahead of the chassis or, those that look
+    back, behind it: rays that start inside a body cost 70 times as much.
+    """
+    up, left = np.radians(LIDAR_ELEVATIONS)[:, None], np.radians(LIDAR_AZIMUTHS)
+    up, left = (angle.ravel() for angle in np.broadcast_arrays(up, left))
+    directions = np.stack([np.cos(up) * np.cos(left), np.cos(up) * np.sin(left), np.sin(up)], 1)
+    return np.where(directions[:, :1] > 0, LIDAR_FRONT, LIDAR_REAR), directions
+
+
+# Memory: how many of the last MEMORY seconds were spent within a metre of each of these points (m,
+# in the base frame), the nearer the more. A near and a far row of them, along the scan's columns.
+MEMORY, MEMORY_RADII = 40, (0.7, 2.0)
+_WAYS = np.radians(LIDAR_AZIMUTHS[0])
+MEMORY_POINTS = np.concatenate(
+    [radius * np.stack([np.cos(_WAYS), np.sin(_WAYS)], 1) for radius in MEMORY_RADII])  # (48, 2)
 
 
 # ------------------------------------------------------------------------------- the environment
@@ -144,7 +163,7 @@ GOAL_RADIUS = 0.5  # m, r_g
 BASE_HEIGHT = 0.30  # m, of the walking base: a goal floats that high over the ground
 EXPLODED = 1e3  # m or rad/s
 FALL_UP, FALL_SPEED = 0.5, 2.5  # fallen: tipped by over 60 degrees, or dropping faster (m/s)
-MAX_EPISODE_STEPS = 600  # 20 s
+MAX_EPISODE_STEPS = 900  # 30 s
 PICTURE = (400, 300)  # pixels
 HOT = ("setJointMotorControlArray", "stepSimulation", "getBasePositionAndOrientation",
        "getBaseVelocity", "getMatrixFromQuaternion", "getJointStates", "rayTestBatch")
@@ -159,17 +178,19 @@ def _about_z(yaw):
 class LocoEnv(gymnasium.Env):
     """A Laikago walks to a goal over terrain that only its LiDAR shows it (section 2).
 
-    ## Observation: Box((202,), float32), in the order of section 2.1
+    ## Observation: Box((330,), float32), in the order of section 2.1
     | entries | meaning | unit |
     |---|---|---|
-    | 160 | r, LiDAR scan: distance / 3 m, 1 = nothing hit; rows from low to high, left to right | |
+    | 240 | r, LiDAR scan: distance / 3 m, 1 = nothing hit; rows from low to high, left to right | |
+    | 48 | memory: time spent lately 0.7 m and 2 m away along each column, log scale; ours | |
     | 1 | g_d, distance to the goal | m |
     | 1 | g_h, heading of the goal relative to the robot's, left positive | rad |
     | 3 | angular rates of the base in its own frame (IMU) | rad/s |
     | 12 | q, joint angles: FR, FL, RR, RL x abduction, hip, knee | rad |
     | 12 | a_{t-1}, joint targets commanded in the previous step | rad |
     | 13 | s_tg, state of the trajectory generator; none with tg=False | |
-    As in the paper it holds neither roll and pitch nor the task. lidar=False leaves out the scan.
+    As in the paper it holds neither roll and pitch nor the task. The scan and the memory are taken
+    at 15 Hz, all else at 30 Hz; lidar=False and memory=False leave them out.
 
     ## Action: Box(-1, 1, (17,), float32), clipped to that range, then smoothed
     5 parameters of the trajectory generator (`tg.PARAMETERS`), then the 12 residuals u_fb;
@@ -193,6 +214,7 @@ class LocoEnv(gymnasium.Env):
             of these; None: all pillar tasks. Each episode draws one; the policy is not told which.
         difficulty: in [0, 1], or (low, high) to draw it from, once for each terrain.
         tg, lidar: the paper's ablations (section 3) leave one of them out.
+        memory: whether the robot knows where it has been; False: the paper's state.
         terrains: how many terrains of each task to build; Bullet never frees a mesh, so the pool
             is built once and episodes draw from it. A finished Terrain counts once.
         pool_seed: seeds the pool; `reset(seed=...)` seeds all else.
@@ -205,8 +227,8 @@ class LocoEnv(gymnasium.Env):
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": round(1 / DT)}
 
-    def __init__(self, tasks=None, difficulty=(0.0, 1.0), tg=True, lidar=True, terrains=1,
-                 pool_seed=0, render_mode=None, gui=False):
+    def __init__(self, tasks=None, difficulty=(0.0, 1.0), tg=True, lidar=True, memory=True,
+                 terrains=1, pool_seed=0, render_mode=None, gui=False):
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
         low, high = difficulty if np.size(difficulty) == 2 else (difficulty, difficulty)
@@ -224,11 +246,15 @@ class LocoEnv(gymnasium.Env):
                      for _ in range(1 if isinstance(task, Terrain) else terrains)]
         self.generator = TrajectoryGenerator() if tg else None
         self._connect(gui)
-        self.n_rays = N_RAYS if lidar else 0
+        rows, columns = LIDAR_AZIMUTHS.shape
+        self.scan_shape = rows * lidar + len(MEMORY_RADII) * memory, columns
+        self.lidar, self.memory = lidar, memory
+        n_scan = math.prod(self.scan_shape)
+        self.scan = np.zeros(n_scan, np.float32)
         # Generous bounds: what lies beyond them is no longer a robot, and the episode ends.
         high = [1e3, np.pi] + [1e3] * 3 + [1e2] * 24 + [1.0] * TrajectoryGenerator.state_size * tg
-        low = np.concatenate([np.zeros(self.n_rays + 1), np.negative(high[1:])])
-        high = np.concatenate([np.ones(self.n_rays), high])
+        low = np.concatenate([np.zeros(n_scan + 1), np.negative(high[1:])])
+        high = np.concatenate([np.ones(n_scan), high])
         self.observation_space = gymnasium.spaces.Box(*np.float32([low, high]))
         n_act = 12 + TrajectoryGenerator.action_size * tg
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (n_act,))
@@ -264,11 +290,11 @@ class LocoEnv(gymnasium.Env):
                 size["length"] = size.pop("height")
                 looks = p.createVisualShape(p.GEOM_CYLINDER, rgbaColor=(0.9, 0.5, 0.2, 1), **size)
             self.people.append(p.createMultiBody(0, shape, looks))
-        ends = np.array(LIDAR_POSITION) + LIDAR_RANGE * lidar_directions()
+        sources, directions = lidar_rays()
         if visual:
             sphere = p.createVisualShape(p.GEOM_SPHERE, radius=0.2, rgbaColor=(0.2, 0.8, 0.3, 1))
             self.flag = p.createMultiBody(0, -1, sphere)
-        self._rays = [LIDAR_POSITION] * N_RAYS, ends.tolist()
+        self._rays = sources.tolist(), (sources + LIDAR_RANGE * directions).tolist()
         self._gains = dict(positionGains=[POSITION_GAIN] * 12, velocityGains=[VELOCITY_GAIN] * 12,
                            forces=[MAX_TORQUE] * 12)
         for _ in range(3):  # Bullet files what stands still elsewhere after two steps: it would
@@ -341,7 +367,7 @@ class LocoEnv(gymnasium.Env):
         p.resetBaseVelocity(self.robot, [0, 0, 0], [0, 0, 0])
         for joint, angle in zip(self.joints, self.target, strict=True):
             p.resetJointState(self.robot, joint, angle)
-        self.time, self.collisions = 0.0, 0
+        self.time, self.steps, self.collisions, self.trail = 0.0, 0, 0, []
         self.touching = self.exploded = False
         for body in self.people:  # not all terrains have as many
             p.resetBasePositionAndOrientation(body, (0, 0, -1000), (0, 0, 0, 1))
@@ -377,8 +403,8 @@ class LocoEnv(gymnasium.Env):
             self.collisions += self.touching and not before
             self._move_people()
 
-        before = self.distance
-        observation = self._observe()
+        before, self.steps = self.distance, self.steps + 1
+        observation = self._observe(self.steps % LIDAR_EVERY == 0)
         if not math.hypot(self.distance, *self.rates) < EXPLODED:  # not: NaN compares to nothing
             p.removeBody(self.robot)
             self._load_robot()
@@ -401,7 +427,7 @@ class LocoEnv(gymnasium.Env):
             place = x + self.origin[0], y, self.terrain.height(x, y) + PERSON_HEIGHT / 2
             self.bullet.resetBasePositionAndOrientation(body, place, _about_z(yaw))
 
-    def _observe(self):
+    def _observe(self, turn_lidar=True):
         p = self.bullet
         position, quaternion = p.getBasePositionAndOrientation(self.robot)
         self.velocity, self.rates = p.getBaseVelocity(self.robot)
@@ -418,12 +444,27 @@ class LocoEnv(gymnasium.Env):
         if self.generator:
             state += self.generator.state()
         observation = np.empty(self.observation_space.shape, dtype=np.float32)
-        observation[self.n_rays :] = state
-        if self.n_rays:
+        observation[self.scan.size :] = state
+        if turn_lidar and self.lidar:
             self.hits = p.rayTestBatch(*self._rays, parentObjectUniqueId=self.robot,
                                        parentLinkIndex=-1, collisionFilterMask=STATIC_GROUP)
-            observation[: self.n_rays] = list(map(HIT_FRACTION, self.hits))
+            self.scan[:N_RAYS] = list(map(HIT_FRACTION, self.hits))
+        if turn_lidar and self.memory:
+            self.scan[self.scan.size - len(MEMORY_POINTS) :] = self._been_there(r)
+        observation[: self.scan.size] = self.scan
         return observation
+
+    def _been_there(self, r):
+        """Memory: time spent around each of MEMORY_POINTS, on a log scale; `r`: base to world."""
+        x, y, _ = self.position
+        if self.time >= len(self.trail):  # one place a second
+            self.trail.append((x, y))
+        size = math.hypot(r[0], r[3])
+        turn = np.array([[r[0], -r[3]], [r[3], r[0]]]) / size  # its columns are forward and left
+        trail = (np.array(self.trail[-MEMORY:]) - (x, y)) @ turn
+        square = (MEMORY_POINTS**2).sum(1)[:, None] + (trail**2).sum(1)
+        seconds = np.maximum(1 - square + 2 * MEMORY_POINTS @ trail.T, 0).sum(1)
+        return np.log1p(seconds) / math.log1p(MEMORY)
 
     def render(self):
         """The robot from above and behind, as uint8 (300, 400, 3)."""
@@ -457,7 +498,7 @@ class LocoEnv(gymnasium.Env):
         legs = np.arange(12).reshape(4, 3)[[1, 0, 3, 2]].ravel()  # joint angles mirror unsigned
         swap = np.array([1, 0, 3, 2])
         parameters = np.array([0, 2, 1, 3, 4])  # left and right stride change places
-        scan = np.arange(self.n_rays).reshape(-1, len(LIDAR_AZIMUTHS))[:, ::-1].ravel()
+        scan = np.arange(math.prod(self.scan_shape)).reshape(self.scan_shape)[:, ::-1].ravel()
         parts, signs = [scan, np.arange(5), legs, legs], np.ones(self.observation_space.shape)
         signs[scan.size + np.array([1, 2, 4])] = -1  # heading, roll rate, yaw rate
         actions = [legs]
@@ -482,7 +523,7 @@ if "LocoMTRL-v0" not in gymnasium.registry:  # run as a script, this file is imp
 # ------------------------------------------------------------------------------- train
 
 REWARD_SCALE = 0.1  # keeps the critic's targets near 1; the environment's own reward is the paper's
-MAIN_STEPS = 2_500_000  # of the no-argument run
+MAIN_STEPS = 3_000_000  # of the no-argument run
 # Short rollouts learn fastest at first; later the noise of so few samples holds the policy back.
 # And a policy is judged without the exploration noise, which has freed it wherever it was stuck: so
 # the last part of the training has little of it.
@@ -507,29 +548,30 @@ def train(args):
         if args.resume:
             load_checkpoint(run_dir / "checkpoint.pt")  # a bad one is better named by one process
         return launch(args)
-    options = {"tg": args.tg, "lidar": args.lidar}
+    options = {"tg": args.tg, "lidar": args.lidar, "memory": args.memory}
     meta = {**options, "tasks": args.tasks, "sequential": args.sequential, "seed": args.seed,
             "command": "python loco_mtrl.py " + " ".join(args.argv), "commit": _commit()}
-    # Tasks, share of all steps done at the end, steps of a rollout, largest std of the noise.
+    # Tasks, share of all steps done at the end, steps of a rollout, gamma, largest std of the noise.
+    # A detour pays after many seconds: 200 steps, 1 / (1 - 0.995), are 6.7 s, and later it is 17 s.
     if args.sequential:  # one task after the other (section 3), each for as long
         n = len(args.tasks)
-        stages = [([task], (k + 1) / n, 256, 1.0) for k, task in enumerate(args.tasks)]
+        stages = [([task], (k + 1) / n, 256, 0.995, 1.0) for k, task in enumerate(args.tasks)]
     else:
-        stages = [(args.tasks, min(SHORT_UNTIL / args.steps, QUIET_FROM), 256, 1.0),
-                  (args.tasks, QUIET_FROM, 512, 1.0), (args.tasks, 1.0, 1024, QUIET_STD)]
+        stages = [(args.tasks, min(SHORT_UNTIL / args.steps, QUIET_FROM), 256, 0.995, 1.0),
+                  (args.tasks, QUIET_FROM, 512, 0.998, 1.0),
+                  (args.tasks, 1.0, 1024, 0.998, QUIET_STD)]
     with contextlib.closing(LocoEnv("flat", **options)) as env:
-        mirror = env.mirror()
-    scan = (len(LIDAR_ELEVATIONS), len(LIDAR_AZIMUTHS)) if args.lidar else (0, 0)
+        mirror, scan = env.mirror(), env.scan_shape
     restarted = os.environ.get("TORCHELASTIC_RESTART_COUNT", "0") != "0"  # torchrun, after a crash
     resume, on_update = args.resume or restarted, tensorboard(run_dir) if args.tensorboard else None
     try:
-        for tasks, share, num_steps, max_std in stages:  # each resumes the one before
+        for tasks, share, num_steps, gamma, max_std in stages:  # each resumes the one before
             config = PPOConfig(
                 total_timesteps=round(share * args.steps), num_envs=10, num_steps=num_steps,
                 num_minibatches=min(num_steps // 50, 10), update_epochs=3, seed=args.seed,
                 checkpoint_every=10_000 // num_steps, exteroceptive=scan,
-                gamma=0.995,  # a detour pays after seconds: 200 steps are 6.7 s
-                learning_rate=5e-4, target_kl=0.015,
+                encoder_hidden=(128, 128), trunk_hidden=(128, 128),
+                gamma=gamma, learning_rate=5e-4, target_kl=0.015,
                 init_std=tuple(INIT_STD[-len(mirror[2]) :].tolist()), max_std=max_std,
             )
             make_env = functools.partial(training_env, seed=args.seed, tasks=tasks, **options)
@@ -628,7 +670,7 @@ def zero_action(observation, env):
 def walk_straight(observation, env):
     """Walks straight at the goal on the same trajectory generator: steers, but sees nothing."""
     action = np.zeros(env.action_space.shape)
-    heading = observation[env.unwrapped.n_rays + 1]
+    heading = observation[math.prod(env.unwrapped.scan_shape) + 1]
     action[1:3] = 0.27 + np.clip(heading, -0.6, 0.6) * np.array([-0.67, 0.67])  # two strides
     return action
 
@@ -645,9 +687,9 @@ def load_actor(name):
         return REFERENCES[name], {}, None
     model, checkpoint = load_policy(name)
     meta = checkpoint["meta"]
-    if not {"tg", "lidar", "tasks", "sequential"} <= set(meta):
+    if not {"tg", "lidar", "memory", "tasks", "sequential"} <= set(meta):
         raise ValueError(f"{name} is not a policy for LocoEnv: {meta}")
-    options, tasks, row = {"tg": meta["tg"], "lidar": meta["lidar"]}, meta["tasks"], "ours"
+    options, tasks, row = {k: meta[k] for k in ("tg", "lidar", "memory")}, meta["tasks"], "ours"
     with contextlib.closing(LocoEnv("flat", **options)) as env:
         size, given = env.observation_space.shape[0], model.kwargs["obs_dim"]
     if size != given:
@@ -884,6 +926,8 @@ def parse(argv):
                    help="comma-separated; default: all %(default)s")
     p.add_argument("--no-tg", dest="tg", action="store_false", help="reactive policy")
     p.add_argument("--no-lidar", dest="lidar", action="store_false", help="blind policy")
+    p.add_argument("--no-memory", dest="memory", action="store_false",
+                   help="policy that does not know where it has been, as in the paper")
     p.add_argument("--sequential", action="store_true", help="one task after the other, not mixed")
     p.add_argument("--seed", type=_whole(0), default=0)
     p.add_argument("--run-dir", default="runs/main", help="(default %(default)s)")

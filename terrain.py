@@ -337,6 +337,19 @@ def obstacles(rng, difficulty):
     return _boxes(rng, 45 * difficulty, (1, 4), (0.3, 1.0))
 
 
+def poles(rng, difficulty):
+    """Up to 20 tables' legs: four poles 7 cm thick, 0.4-1.4 m apart and 0.4-1.2 m tall, each."""
+    h = np.zeros((3 * SHAPE[0], 3 * SHAPE[1]))
+    for _ in range(round(20 * difficulty)):
+        i, j = rng.integers(PAD, SHAPE[0] - PAD), rng.integers(SHAPE[1])
+        a, b = np.minimum((i, j) + rng.integers(2, 8, 2), np.subtract(SHAPE, 1))
+        h[np.ix_([3 * i, 3 * a], [3 * j, 3 * b])] = rng.uniform(0.4, 1.2)
+    return h
+
+
+poles.cell = L / 3  # m, cross-section of the pillars: L and W are too thick for a leg
+
+
 def stairs(rng, difficulty):
     """Flights up and down, 3 to 7 steps of up to 0.18 m, treads of 0.4 or 0.6 m."""
     n = rng.integers(3, 8)
@@ -430,36 +443,60 @@ def walls(rng, difficulty):
     return h
 
 
-def rooms(rng, difficulty):
-    """Rooms of 2.2-4.0 m with doors of 0.8-1.6 m in most walls, and up to 15 things in them."""
+def _doors(rng, walls, extra):
+    """Which of the walls between rooms, pairs (a, b) of their numbers, have a door.
+
+    A random spanning tree, so that every room can be reached, and a share `extra` of the rest.
+    """
+    group = np.arange(np.max(walls) + 1)  # rooms that are connected share a number
+    doors = np.zeros(len(walls), bool)
+    for k in rng.permutation(len(walls)):
+        one, other = group[list(walls[k])]
+        doors[k] = one != other or rng.random() < extra
+        group[group == other] = one
+    return doors
+
+
+def _rooms(rng, x, y, difficulty, door):
+    """Rooms between walls on the lines `x` across the way and `y` along it (pillars).
+
+    Doors are `door` = (least, most) pillars wide; the harder, the fewer: 1 leaves one way.
+    """
     h = np.zeros(SHAPE)
-    rows = np.arange(PAD + 1, SHAPE[0] - PAD, rng.integers(12, 22))
-    columns = np.arange(rng.integers(4, 12), SHAPE[1] - 3, rng.integers(12, 22))
-    h[rows], h[rows[0] : rows[-1], columns] = _wall(difficulty), _wall(difficulty)
-    for lines, crossing, view in ((rows, columns, h), (columns, rows, h.T)):
-        border = [0, view.shape[1]] if view is h else []
-        ends = np.unique(np.r_[border, crossing]).astype(int)
-        for line in lines:
-            for a, b in pairwise(ends):
-                door = rng.integers(4, 9)
-                if b - a > 5 and rng.random() < 1 - 0.2 * difficulty:
-                    at = rng.integers(a + 1, max(b - door, a + 1) + 1)
-                    view[line, at : min(at + door, b)] = 0
+    h[x], h[x[0] : x[-1], y] = 1, 1
+    nx, ny = len(x) - 1, len(y) - 1
+    room = np.arange(nx * ny).reshape(nx, ny)
+    room = np.pad(room, ((1, 1), (0, 0)), constant_values=((nx * ny, nx * ny + 1), (0, 0)))
+    walls = [(room[i, j], room[i + 1, j], h[x[i], y[j] + 1 : y[j + 1]])
+             for i in range(nx + 1) for j in range(ny)]
+    walls += [(room[i + 1, j - 1], room[i + 1, j], h[x[i] + 1 : x[i + 1], y[j]])
+              for i in range(nx) for j in range(1, ny)]
+    for k in np.flatnonzero(_doors(rng, [wall[:2] for wall in walls], 0.8 * (1 - difficulty))):
+        wall = walls[k][2]
+        wide = min(rng.integers(door[0], door[1] + 1), len(wall))
+        at = rng.integers(len(wall) - wide + 1)
+        wall[at : at + wide] = 0
+    return h * _wall(difficulty)
+
+
+def _lines(rng, low, high, size):
+    """Lines from `low` to `high` (pillars), `size` = (least, most) apart, the last ones farther."""
+    lines = low + np.r_[0, np.cumsum(rng.integers(size[0], size[1] + 1, 9))]
+    return np.r_[lines[lines <= high - size[0]], high]
+
+
+def rooms(rng, difficulty):
+    """Rooms of 1.4 m and more with doors of 0.8-1.6 m, and up to 15 things in them."""
+    x = _lines(rng, PAD + 1, SHAPE[0] - PAD - 2, (8, 21))
+    h = _rooms(rng, x, _lines(rng, 0, SHAPE[1] - 1, (8, 21)), difficulty, (4, 8))
     return np.maximum(h, _boxes(rng, 15 * difficulty, (1, 4), (0.3, 1.2)))
 
 
 def mazes(rng, difficulty):
-    """Rooms of 1.4-2.2 m in a grid, up to 6 in 10 of the walls between them standing."""
-    pitch = rng.integers(8, 13)  # pillars
-    x, y = np.arange(PAD + 1, SHAPE[0] - PAD, pitch), np.arange(rng.integers(4), SHAPE[1], pitch)
-    h = np.zeros(SHAPE)
-    for i in x:
-        for j in y:
-            tall = _wall(difficulty) * (rng.random(2) < 0.2 + 0.4 * difficulty)
-            h[i : i + pitch + 1, j] = np.maximum(h[i : i + pitch + 1, j], tall[0])
-            h[i, j : j + pitch + 1] = np.maximum(h[i, j : j + pitch + 1], tall[1])
-    h[-PAD:] = 0
-    return h
+    """Mazes of corridors 1.4-1.8 m wide, at the border a little more."""
+    size = [rng.integers(8, 11)] * 2
+    x = _lines(rng, PAD + 1, SHAPE[0] - PAD - 2, size)
+    return _rooms(rng, x, _lines(rng, 0, SHAPE[1] - 1, size), difficulty, (99, 99))
 
 
 def screens(rng, difficulty):
@@ -520,7 +557,7 @@ def waves(rng, difficulty):
 PILLAR_TASKS = {
     task.__name__: task
     for task in (
-        flat, rugged, holes, obstacles, stairs, stones, slopes, inclines, pyramids_up,
+        flat, rugged, holes, obstacles, poles, stairs, stones, slopes, inclines, pyramids_up,
         pyramids_down, gaps, hurdles, ridges, pits, coasts, corridors, walls, rooms, mazes,
         screens, traps, blocks, waves, crags,
     )
@@ -543,19 +580,20 @@ def make_terrain(task, rng, difficulty):
     if not 0 <= difficulty <= 1:
         raise ValueError(f"difficulty must be in [0, 1], got {difficulty}")
     generate = task if callable(task) else PILLAR_TASKS[task]
-    name = getattr(generate, "__name__", "terrain")
+    name, cell = getattr(generate, "__name__", "terrain"), getattr(generate, "cell", L)
     for _ in range(TRIES):
         heights = np.array(generate(rng, difficulty), float)
-        mesh = fuse_pillars(heights, L, W)
-        for strip in (heights[:PAD], heights[-PAD:]):
+        mesh = fuse_pillars(heights, cell, cell)
+        pad = round(PAD * L / cell)
+        for strip in (heights[:pad], heights[-pad:]):
             strip[:] = np.median(strip)
-        ground = Ground(heights, (L, W))
+        ground = Ground(heights, (cell, cell))
         length = ground.size[0]
         # From either end, and from wherever else a robot can stand: in a maze, on a ridge.
         zones = (1.0, PAD * L), (length - PAD * L, length - 1.0), (0.0, length)
         routes = _routes(ground, rng, ROUTES, (min(6, length / 2), 9), STEP, zones, margin=1.0)
         if routes:
-            mesh = fuse_pillars(heights, L, W)
+            mesh = fuse_pillars(heights, cell, cell)
             tilt = difficulty * getattr(generate, "tilt", 0.0)
             return Terrain(name, *mesh, *routes, ground, tilt=tilt)
     raise ValueError(f"task {name!r} gave no walkable route in {TRIES} draws of {heights.shape}")
@@ -648,19 +686,13 @@ def maze(rng):
     nx, ny, pitch = 8, 6, 13  # pitch in FINE cells: the corridor's 12 and the wall's 1
     plan = np.zeros((nx * pitch + 1, ny * pitch + 1))
     plan[::pitch], plan[:, ::pitch] = 1.3, 1.3
-    inner = [(i, j, 1, 0) for i in range(1, nx) for j in range(ny)]
-    inner += [(i, j, 0, 1) for i in range(nx) for j in range(1, ny)]
-    room = np.arange(nx * ny).reshape(nx, ny)  # rooms that are connected share a number
-    for k in rng.permutation(len(inner)):
-        i, j, across, along = inner[k]
-        one, other = room[i - across, j - along], room[i, j]
-        if one != other or rng.random() < 0.125:
-            room[room == other] = one
-            a, b = i * pitch, j * pitch
-            if across:
-                plan[a, b + 1 : b + pitch] = 0
-            else:
-                plan[a + 1 : a + pitch, b] = 0
+    room = np.arange(nx * ny).reshape(nx, ny)
+    walls = [(room[i - 1, j], room[i, j], plan[i * pitch, j * pitch + 1 : (j + 1) * pitch])
+             for i in range(1, nx) for j in range(ny)]
+    walls += [(room[i, j - 1], room[i, j], plan[i * pitch + 1 : (i + 1) * pitch, j * pitch])
+              for i in range(nx) for j in range(1, ny)]
+    for k in np.flatnonzero(_doors(rng, [wall[:2] for wall in walls], 0.125)):
+        walls[k][2][:] = 0
     return _world("maze", rng, plan, fuse_pillars(plan, FINE, FINE), LEVEL)
 
 

@@ -13,9 +13,10 @@ from hypothesis.extra.numpy import arrays
 
 import loco_mtrl
 import terrain
-from loco_mtrl import DT, GOAL_RADIUS, LIDAR_POSITION, LIDAR_RANGE, N_RAYS, LocoEnv
+from loco_mtrl import DT, GOAL_RADIUS, LIDAR_FRONT, LIDAR_RANGE, N_RAYS, LocoEnv
 
 SHAPE = (60, 40)
+N_SCAN = N_RAYS + len(loco_mtrl.MEMORY_POINTS)
 
 
 def wall_ahead(rng, difficulty):
@@ -48,7 +49,7 @@ def place(env, x, y, z, yaw=0.0, roll=0.0):
     return env._observe()
 
 
-@pytest.mark.parametrize("options", [{}, {"tg": False}, {"lidar": False}])
+@pytest.mark.parametrize("options", [{}, {"tg": False}, {"lidar": False}, {"memory": False}])
 def test_gymnasium_checks_pass_without_a_warning(options):
     env = gymnasium.make("LocoMTRL-v0", tasks="rugged", render_mode="rgb_array", **options)
     check_env(env.unwrapped)
@@ -58,7 +59,7 @@ def test_gymnasium_checks_pass_without_a_warning(options):
 def test_observation_has_the_papers_parts_in_its_order(flat):
     observation, _ = flat.reset(seed=3)
     scan, goal, rates, joints, target, s_tg = np.split(
-        observation, np.cumsum([N_RAYS, 2, 3, 12, 12])
+        observation, np.cumsum([N_SCAN, 2, 3, 12, 12])
     )
     assert scan.min() >= 0 and scan.max() <= 1
     assert goal[0] == pytest.approx(np.linalg.norm(np.subtract(flat.goal, flat.position)))
@@ -70,7 +71,7 @@ def test_observation_has_the_papers_parts_in_its_order(flat):
 def test_heading_is_left_positive_and_relative_to_the_robot(flat):
     flat.reset(seed=0)
     flat.goal = flat.origin + [6.0, 2.0, 0.5]
-    heading = lambda yaw: place(flat, 6.0, 0.0, 0.5, yaw)[N_RAYS + 1]  # noqa: E731
+    heading = lambda yaw: place(flat, 6.0, 0.0, 0.5, yaw)[N_SCAN + 1]  # noqa: E731
     assert heading(0.0) == pytest.approx(np.pi / 2, abs=1e-6)
     assert heading(np.pi / 2) == pytest.approx(0.0, abs=1e-6)
     assert heading(-np.pi / 4) == pytest.approx(3 * np.pi / 4, abs=1e-6)
@@ -80,7 +81,7 @@ def test_imu_gives_rates_in_the_frame_of_the_base(flat):
     flat.reset(seed=0)
     place(flat, 6, 0, 0.5, yaw=np.pi / 2)
     flat.bullet.resetBaseVelocity(flat.robot, (0, 0, 0), (1.0, 2.0, 3.0))
-    rates = flat._observe()[N_RAYS + 2 : N_RAYS + 5]
+    rates = flat._observe()[N_SCAN + 2 : N_SCAN + 5]
     np.testing.assert_allclose(rates, [2.0, -1.0, 3.0], atol=1e-5)
 
 
@@ -90,8 +91,8 @@ def test_lidar_over_a_plane(plane, height, yaw):
     plane.reset(seed=0)
     scan = place(plane, 15.0, 0.0, height, yaw)[:N_RAYS]
     with np.errstate(divide="ignore"):
-        drop = -loco_mtrl.lidar_directions()[:, 2]
-        expected = np.where(drop > 0, (height + LIDAR_POSITION[2]) / drop / LIDAR_RANGE, 1.0)
+        drop = -loco_mtrl.lidar_rays()[1][:, 2]
+        expected = np.where(drop > 0, (height + LIDAR_FRONT[2]) / drop / LIDAR_RANGE, 1.0)
     np.testing.assert_allclose(scan, np.minimum(expected, 1.0), atol=2e-4)
 
 
@@ -100,14 +101,14 @@ def test_lidar_sees_a_wall_at_its_distance():
     env.reset(seed=0)
     yaw = 0.3
     scan = place(env, 4.5, -1.0, 0.5, yaw)[:N_RAYS]
-    directions = loco_mtrl.lidar_directions()
+    sources, directions = loco_mtrl.lidar_rays()
     turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
-    origin = np.array([4.5, -1.0, 0.5]) + turn @ LIDAR_POSITION
+    x, y, z = (np.array([4.5, -1.0, 0.5]) + sources @ turn.T).T
     directions = directions @ turn.T
     with np.errstate(divide="ignore"):
-        to_wall = np.where(directions[:, 0] > 0, (6.0 - origin[0]) / directions[:, 0], np.inf)
-        to_floor = np.where(directions[:, 2] < 0, -origin[2] / directions[:, 2], np.inf)
-    inside = np.abs((origin + to_wall[:, None].clip(0, 9) * directions)[:, 1] + 0.8) < 3.1
+        to_wall = np.where(directions[:, 0] > 0, (6.0 - x) / directions[:, 0], np.inf)
+        to_floor = np.where(directions[:, 2] < 0, -z / directions[:, 2], np.inf)
+    inside = np.abs(y + to_wall.clip(0, 9) * directions[:, 1] + 0.8) < 3.1
     expected = np.minimum(np.where(inside, to_wall, np.inf), to_floor).clip(0, LIDAR_RANGE)
     compared = inside | ~np.isfinite(to_wall)
     np.testing.assert_allclose(scan[compared], expected[compared] / LIDAR_RANGE, atol=2e-4)
@@ -125,13 +126,13 @@ def with_person(x0, x1, speed):
 def test_lidar_sees_a_person_where_he_is_and_as_he_moves():
     env = with_person(7.0, 5.0, speed=1.0)
     env.reset(seed=0)
-    row, column = loco_mtrl.LIDAR_ELEVATIONS.index(-3), 7  # the ray 5.67 degrees to the left
-    yaw = -np.radians(loco_mtrl.LIDAR_AZIMUTHS[column])
-    sensor = 3.6 + LIDAR_POSITION[0] * np.cos(yaw), LIDAR_POSITION[0] * np.sin(yaw)
+    row, column = loco_mtrl.LIDAR_ELEVATIONS.index(-3), 11  # a ray a little to the left
+    yaw = -np.radians(loco_mtrl.LIDAR_AZIMUTHS[row, column])
+    sensor = 3.6 + LIDAR_FRONT[0] * np.cos(yaw), LIDAR_FRONT[0] * np.sin(yaw)
     for seconds in (0.0, 0.5, 1.0, 2.5):
         env.time = seconds
         env._move_people()
-        scan = place(env, 3.6, 0.0, 0.4, yaw)[:N_RAYS].reshape(-1, len(loco_mtrl.LIDAR_AZIMUTHS))
+        scan = place(env, 3.6, 0.0, 0.4, yaw)[:N_RAYS].reshape(loco_mtrl.LIDAR_AZIMUTHS.shape)
         centre = 7.0 - seconds if seconds <= 2 else 5.0 + (seconds - 2)
         along = centre - sensor[0] - np.sqrt(terrain.PERSON_RADIUS**2 - sensor[1] ** 2)
         expected = min(along / np.cos(np.radians(3)) / LIDAR_RANGE, 1.0)
@@ -154,11 +155,45 @@ def test_lidar_never_sees_the_robot(flat):
     before = place(flat, 6.0, 0.0, 0.9)[:N_RAYS]
     for joint, angle in zip(flat.joints, [0.0, -1.5, -0.15] * 4, strict=True):
         flat.bullet.resetJointState(flat.robot, joint, angle)
-    starts = [(LIDAR_POSITION[0] + 6 + flat.origin[0], 0, 0.98)] * N_RAYS
-    ends = np.array(starts) + LIDAR_RANGE * loco_mtrl.lidar_directions()
-    seen = [hit[0] for hit in flat.bullet.rayTestBatch(starts, ends.tolist())]
+    sources, directions = loco_mtrl.lidar_rays()
+    starts = sources + flat.origin + [6.0, 0.0, 0.9]
+    ends = starts + LIDAR_RANGE * directions
+    seen = [hit[0] for hit in flat.bullet.rayTestBatch(starts.tolist(), ends.tolist())]
     assert flat.robot in seen  # without the filter it would see its leg
     np.testing.assert_array_equal(flat._observe()[:N_RAYS], before)
+
+
+def test_the_scan_is_taken_every_other_step(flat):
+    flat.reset(seed=0)
+    scans = [flat.step(np.zeros(17))[0][:N_SCAN] for _ in range(8)]
+    changed = [bool((a != b).any()) for a, b in zip(scans, scans[1:], strict=False)]
+    assert changed == [True, False] * 3 + [True]
+
+
+def test_memory_is_the_time_spent_around_each_point(flat):
+    """Against the definition, point by point, for a robot that came along an L."""
+    flat.reset(seed=0)
+    place(flat, 6.0, 1.0, 0.6, yaw=2.0)
+    trail = [(4 + 0.2 * k, 0.0) for k in range(30)] + [(6.0, 0.1 * k) for k in range(20)]
+    flat.trail = [(flat.origin[0] + x, y) for x, y in trail]
+    memory = flat._observe()[N_RAYS:N_SCAN].reshape(2, -1)
+    for radius, row in zip(loco_mtrl.MEMORY_RADII, memory, strict=True):
+        for azimuth, value in zip(np.radians(loco_mtrl.LIDAR_AZIMUTHS[0]), row, strict=True):
+            x, y = 6 + radius * np.cos(2 + azimuth), 1 + radius * np.sin(2 + azimuth)
+            square = [(x - a) ** 2 + (y - b) ** 2 for a, b in trail[-loco_mtrl.MEMORY :]]
+            seconds = sum(max(1 - s, 0) for s in square)
+            assert value == pytest.approx(math.log(1 + seconds) / math.log(41), abs=1e-5)
+    assert memory[1].max() > 0.5 and memory[1].min() == 0
+
+
+def test_memory_drops_a_place_a_second_and_forgets_between_episodes(flat):
+    flat.reset(seed=0)
+    assert len(flat.trail) == 1
+    for _ in range(95):
+        flat.step(np.zeros(17))
+    assert len(flat.trail) == 4  # after 0, 1, 2 and 3 s
+    flat.reset()
+    assert flat.trail == [pytest.approx(flat.position[:2])]
 
 
 def test_reward_is_velocity_toward_the_goal_and_sums_to_the_progress():
@@ -241,7 +276,7 @@ def test_time_limit_truncates():
         _, _, terminated, truncated, _ = env.step(np.zeros(17, np.float32))
         assert truncated == (step == 7) and not terminated
     env.close()
-    assert gymnasium.spec("LocoMTRL-v0").max_episode_steps == 600
+    assert gymnasium.spec("LocoMTRL-v0").max_episode_steps == 900
 
 
 def episode(env, seed, steps=300):
@@ -319,7 +354,7 @@ def test_any_finite_action_gives_an_observation_in_the_space(flat, action):
 
 
 def test_mirror_is_its_own_inverse_and_fits_the_spaces():
-    for options in ({}, {"tg": False}, {"lidar": False}):
+    for options in ({}, {"tg": False}, {"lidar": False}, {"memory": False}):
         env = LocoEnv("flat", **options)
         i, s, j, t = env.mirror()
         observation = np.arange(env.observation_space.shape[0], dtype=float)
@@ -343,6 +378,7 @@ def test_mirror_is_what_a_mirrored_robot_would_observe(flat):
         joints = (joints if side > 0 else joints[[1, 0, 3, 2]]).ravel()
         for joint, angle in zip(flat.joints, joints, strict=True):
             flat.bullet.resetJointState(flat.robot, joint, angle)
+        flat.trail = [(flat.origin[0] + 5.0, 0.7 * side), (flat.origin[0] + 5.5, -0.1 * side)]
         place(flat, 6.0, 0.2 * side, 0.6, yaw=0.4 * side, roll=0.1 * side)
         flat.bullet.resetBaseVelocity(flat.robot, (0, 0, 0), (0.3 * side, 0.5, 0.7 * side))
         observations.append(flat._observe())
