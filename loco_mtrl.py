@@ -551,7 +551,7 @@ def train(args):
     options = {"tg": args.tg, "lidar": args.lidar, "memory": args.memory}
     meta = {**options, "tasks": args.tasks, "sequential": args.sequential, "seed": args.seed,
             "command": "python loco_mtrl.py " + " ".join(args.argv), "commit": _commit()}
-    # Tasks, share of all steps done at the end, steps of a rollout, gamma, largest std of the noise.
+    # Tasks, share of all steps done at the end, steps of a rollout, gamma, largest std of noise.
     # A detour pays after many seconds: 200 steps, 1 / (1 - 0.995), are 6.7 s, and later it is 17 s.
     if args.sequential:  # one task after the other (section 3), each for as long
         n = len(args.tasks)
