@@ -331,7 +331,10 @@ class LocoEnv(gymnasium.Env):
     # ---------------------------------------------------------------- one episode
 
     def reset(self, *, seed=None, options=None):
-        """Stands the robot at a start; `options={"terrain": i, "route": k}` chooses which."""
+        """Stands the robot at a start; `options={"terrain": i, "route": k}` chooses which.
+
+        Raises ValueError for another option, or one that the pool has not.
+        """
         super().reset(seed=seed)
         p, rng, options = self.bullet, self.np_random, options or {}
         # The terrain that has had least so far comes next. Seconds are shared, not episodes, or
@@ -346,9 +349,14 @@ class LocoEnv(gymnasium.Env):
             self.spent[:] = 0
         least = np.flatnonzero(self.spent == self.spent.min())
         index = options.get("terrain", rng.choice(least))
-        self.index, self.terrain = index, self.pool[index]
+        if not set(options) <= {"terrain", "route"} or index not in range(len(self.pool)):
+            known = f"terrain, in range({len(self.pool)}), and route"
+            raise ValueError(f"options may be {known}, got {options}")
+        self.index, self.terrain = index, self.pool[int(index)]
         terrain = self.terrain
         route = options.get("route", rng.integers(len(terrain.starts)))
+        if route not in range(len(terrain.starts)):
+            raise ValueError(f"route must be in range({len(terrain.starts)}), got {route!r}")
         self.origin = np.array([self.offsets[index], 0.0, 0.0])
         x, y, z, yaw = terrain.starts[route]
         self.goal = (terrain.goals[route] + self.origin + [0, 0, BASE_HEIGHT]).tolist()

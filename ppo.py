@@ -287,8 +287,13 @@ def compute_gae(rewards, values, terminated, done, prev_done, gamma, gae_lambda)
         prev_done: (T, N), whether step t is a reset row, the step before it having been done.
 
     Returns advantages and returns (the critic's targets), (T, N) each. Both are 0 in reset rows,
-    which belong to no episode and must be left out of losses and statistics.
+    which belong to no episode and must be left out of losses and statistics. Raises ValueError if
+    the shapes do not fit.
     """
+    shapes = [tuple(x.shape) for x in (values[1:], terminated, done, prev_done)]
+    if shapes != [tuple(rewards.shape)] * 4:
+        raise ValueError(f"rewards are {tuple(rewards.shape)}, so values[1:], terminated, done and "
+                         f"prev_done must be, too; they are {shapes}")
     delta = rewards + gamma * values[1:] * ~terminated - values[:-1]  # (T, N)
     advantages = torch.zeros_like(delta)
     following = torch.zeros_like(delta[0])  # (N,)

@@ -147,6 +147,17 @@ def _walls(heights):
     return tuple(a[z0 != z1] for a in (i + 1, j0, j1, z0, z1))
 
 
+def _heights(heights, least, cell):
+    """`heights` as an array of at least `least` a side; ValueError if they or `cell` are no good."""
+    heights = np.asarray(heights, float)
+    if heights.ndim != 2 or min(heights.shape) < least or not np.isfinite(heights).all():
+        raise ValueError(f"heights must be a finite 2-D array of at least {least} x {least}, "
+                         f"got shape {heights.shape}")
+    if not all(0 < side < np.inf for side in cell):
+        raise ValueError(f"the cross-section must be positive and finite, got {tuple(cell)}")
+    return heights
+
+
 def fuse_pillars(heights, l, w):  # noqa: E741 - the paper's own names
     """Mesh of m x n pillars without any face that cannot be seen (paper section 2.3).
 
@@ -157,11 +168,7 @@ def fuse_pillars(heights, l, w):  # noqa: E741 - the paper's own names
     Returns vertices (V, 3) float64 in m and triangles (F, 3) int32, counter-clockwise from outside.
     Raises ValueError if `heights` is not a finite 2-D array or a cross-section is not positive.
     """
-    heights = np.asarray(heights, float)
-    if heights.ndim != 2 or not heights.size or not np.isfinite(heights).all():
-        raise ValueError(f"heights must be a finite 2-D array, got shape {heights.shape}")
-    if not (0 < l < np.inf and 0 < w < np.inf):
-        raise ValueError(f"pillar cross-section must be positive, got l={l}, w={w}")
+    heights = _heights(heights, 1, (l, w))
     y_of = lambda j: (j - heights.shape[1] / 2) * w  # noqa: E731
 
     row, j0, j1 = _runs(heights)
@@ -608,8 +615,9 @@ LEVEL = 0.05  # m, highest step where no climbing is asked for
 def triangulate(heights, cell):
     """Continuous mesh through (m + 1) x (n + 1) nodes, the surface of `Ground(..., smooth=True)`.
 
-    Returns vertices and triangles as `fuse_pillars` does. heights: m; cell: (l, w), m.
+    Returns and raises as `fuse_pillars` does. heights: m, at least 2 x 2; cell: (l, w), m.
     """
+    heights = _heights(heights, 2, cell)
     i, j = np.indices(heights.shape)
     n = heights.shape[1]
     vertices = np.stack([i * cell[0], (j - (n - 1) / 2) * cell[1], heights], -1).reshape(-1, 3)

@@ -120,7 +120,9 @@ class TrajectoryGenerator:
         self.reset()
 
     def reset(self, phase=0.0):
-        """Starts the stride at `phase` (rad) with the parameters of the zero action."""
+        """Starts the stride at `phase` (rad, else ValueError) with the zero action's parameters."""
+        if not math.isfinite(phase):
+            raise ValueError(f"phase must be a finite number, got {phase}")
         self.phase = float(phase) % (2 * np.pi)
         self.scaled, self.parameters = [0.0] * len(PARAMETERS), CENTRE.tolist()
 
@@ -129,15 +131,17 @@ class TrajectoryGenerator:
 
         Args:
             action: (5,) in [-1, 1], in the order of PARAMETERS; clipped to that range.
-            dt: s.
+            dt: s, at least 0.
         Returns:
             u_tg: (12,) joint targets, rad.
         Raises:
-            ValueError: if `action` has another shape or is not finite.
+            ValueError: if `action` has another shape or is not finite, or dt is not a time.
         """
         action = np.asarray(action, dtype=np.float64)
         if action.shape != CENTRE.shape or not math.isfinite(sum(action.tolist())):
             raise ValueError(f"action must be {CENTRE.size} finite numbers, got {action}")
+        if not 0 <= dt < math.inf:
+            raise ValueError(f"dt must be at least 0 and finite, got {dt}")
         # Lists from here on: NumPy is slow on so few numbers.
         self.scaled = [min(max(value, -1.0), 1.0) for value in action.tolist()]
         pairs = zip(PARAMETERS.values(), self.scaled, strict=True)

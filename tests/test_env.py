@@ -406,6 +406,14 @@ def test_bad_arguments_are_named(options, named):
         LocoEnv(**options)
 
 
+@pytest.mark.parametrize("options", [{"terrain": 1}, {"terrain": -1}, {"terrain": "flat"},
+                                     {"route": 8}, {"route": 0.5}, {"route": np.nan},
+                                     {"seed": 3}])  # fmt: skip
+def test_bad_reset_options_are_named(flat, options):
+    with pytest.raises(ValueError, match=next(iter(options))):
+        flat.reset(seed=0, options=options)
+
+
 @pytest.mark.parametrize("action", [np.zeros(16), np.full(17, np.nan), np.full(17, np.inf), 0.0])
 def test_bad_actions_are_named(flat, action):
     flat.reset(seed=0)

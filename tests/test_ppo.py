@@ -121,6 +121,16 @@ def test_gae_is_its_definition(ends, starts_with_reset, gamma, lam, seed):
         assert got == pytest.approx(expected, abs=1e-12)
 
 
+@pytest.mark.parametrize("argument", range(1, 5))
+def test_gae_refuses_shapes_that_do_not_fit(argument):
+    no = torch.zeros(3, 2, dtype=torch.bool)
+    arguments = [torch.zeros(3, 2), torch.zeros(4, 2), no, no, no]
+    compute_gae(*arguments, 0.9, 0.9)
+    arguments[argument] = arguments[argument][:-1]
+    with pytest.raises(ValueError, match="must be"):
+        compute_gae(*arguments, 0.9, 0.9)
+
+
 # --- the loss
 
 

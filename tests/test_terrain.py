@@ -149,12 +149,16 @@ def test_smooth_ground_is_its_triangles(client):
 def test_bad_heights_are_named(heights):
     with pytest.raises(ValueError, match="finite 2-D"):
         fuse_pillars(heights, L, W)
+    with pytest.raises(ValueError, match="finite 2-D"):
+        terrain.triangulate(heights, (L, W))
 
 
 @pytest.mark.parametrize("size", [0.0, -1.0, np.nan, np.inf])
 def test_bad_pillar_sizes_are_named(size):
     with pytest.raises(ValueError, match="positive"):
         fuse_pillars(np.zeros((2, 2)), L, size)
+    with pytest.raises(ValueError, match="positive"):
+        terrain.triangulate(np.zeros((2, 2)), (size, W))
 
 
 # ---------------------------------------------------------------- tasks

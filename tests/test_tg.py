@@ -163,6 +163,11 @@ def test_left_and_right_are_mirror_images():
         lambda: tg.TrajectoryGenerator().step(np.zeros(4), 0.01),
         lambda: tg.TrajectoryGenerator().step([np.nan] * 5, 0.01),
         lambda: tg.TrajectoryGenerator().step([np.inf, 0, 0, 0, 0], 0.01),
+        lambda: tg.TrajectoryGenerator().step(np.zeros(5), -0.01),
+        lambda: tg.TrajectoryGenerator().step(np.zeros(5), np.nan),
+        lambda: tg.TrajectoryGenerator().step(np.zeros(5), np.inf),
+        lambda: tg.TrajectoryGenerator().reset(np.nan),
+        lambda: tg.TrajectoryGenerator().reset(-np.inf),
     ],
 )
 def test_bad_input_is_named(call):
