@@ -148,7 +148,7 @@ def _walls(heights):
 
 
 def _heights(heights, least, cell):
-    """`heights` as an array of at least `least` a side; ValueError if they or `cell` are no good."""
+    """`heights` as an array, `least` or more a side; ValueError if they or `cell` are no good."""
     heights = np.asarray(heights, float)
     if heights.ndim != 2 or min(heights.shape) < least or not np.isfinite(heights).all():
         raise ValueError(f"heights must be a finite 2-D array of at least {least} x {least}, "
