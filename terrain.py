@@ -96,7 +96,7 @@ class Ground:
 class Terrain:
     """One place to walk in: a triangle mesh, routes over it, the height under a point.
 
-    An episode draws one k: it begins at `starts[k]`, facing its own goal `goals[k]`.
+    An episode draws one k: it begins at `starts[k]`, mostly facing its own goal, `goals[k]`.
     """
 
     name: str
@@ -596,10 +596,13 @@ def make_terrain(task, rng, difficulty):
             strip[:] = np.median(strip)
         ground = Ground(heights, (cell, cell))
         length = ground.size[0]
-        # From either end, and from wherever else a robot can stand: in a maze, on a ridge.
+        # From either end, in turn with wherever else a robot can stand: in a maze, on a ridge.
         zones = (1.0, PAD * L), (length - PAD * L, length - 1.0), (0.0, length)
         routes = _routes(ground, rng, ROUTES, (min(6, length / 2), 9), STEP, zones, margin=1.0)
         if routes:
+            # Some begin with their back to the goal: what lies behind it is worth a look, too.
+            yaw = routes[0][2::3, 3]
+            yaw += rng.uniform(-np.pi, np.pi, len(yaw))
             mesh = fuse_pillars(heights, cell, cell)
             tilt = difficulty * getattr(generate, "tilt", 0.0)
             return Terrain(name, *mesh, *routes, ground, tilt=tilt)
