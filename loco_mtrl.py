@@ -537,9 +537,6 @@ MAIN_STEPS = 3_000_000  # of the no-argument run
 # the last part of the training has little of it.
 SHORT_UNTIL = 400_000  # steps
 QUIET_FROM, QUIET_STD = 0.7, 0.2  # share of all steps, largest standard deviation from there on
-# Standard deviation of that noise at first: large on the two strides, for a way around must be
-# steered for a second before it pays; small on all else, or the noise throws the robot over.
-INIT_STD = np.array([0.37, 0.6, 0.6, 0.37, 0.37] + [0.37] * 12)
 
 
 def training_env(index, seed, **options):
@@ -580,7 +577,7 @@ def train(args):
                 checkpoint_every=10_000 // num_steps, exteroceptive=scan,
                 encoder_hidden=(128, 128), trunk_hidden=(128, 128),
                 gamma=gamma, learning_rate=5e-4, target_kl=0.015,
-                init_std=tuple(INIT_STD[-len(mirror[2]) :].tolist()), max_std=max_std,
+                max_std=max_std,
             )
             make_env = functools.partial(training_env, seed=args.seed, tasks=tasks, **options)
             learn(make_env, config, run_dir=run_dir, resume=resume, mirror=mirror, meta=meta,
