@@ -195,6 +195,32 @@ def test_the_same_generator_gives_the_same_terrain():
         assert one.vertices.shape != other.vertices.shape or (one.vertices != other.vertices).any()
 
 
+@settings(max_examples=40, deadline=None)
+@given(st.integers(1, 6), st.integers(2, 6), st.integers(0, 99))
+def test_doors_join_all_rooms_in_one_way_only(nx, ny, seed):
+    """A tree: one door fewer than rooms, and every room is met from the first."""
+    room = np.arange(nx * ny).reshape(nx, ny)
+    walls = [*zip(room[1:].ravel(), room[:-1].ravel(), strict=True),
+             *zip(room[:, 1:].ravel(), room[:, :-1].ravel(), strict=True)]  # fmt: skip
+    doors = terrain._doors(np.random.default_rng(seed), walls, 0.0)
+    assert doors.sum() == nx * ny - 1
+    met = {0}
+    for _ in range(nx * ny):
+        met |= {b for pair, open_ in zip(walls, doors, strict=True) if open_ and met & {*pair}
+                for b in pair}  # fmt: skip
+    assert len(met) == nx * ny
+    assert terrain._doors(np.random.default_rng(seed), walls, 1.0).all()
+
+
+def test_thin_pillars_are_seen_by_the_search_for_routes():
+    """No pole, 7 cm thick, within 0.2 m of a start or a goal, where a robot's legs would be."""
+    place = make_terrain("poles", np.random.default_rng(0), 1.0)
+    poles = (np.argwhere(place.height.heights > 0) + 0.5) * place.height.cell - [0, 4]
+    assert len(poles) > 60
+    for x, y, *_ in [*place.starts, *place.goals]:
+        assert np.hypot(*(poles - [x, y]).T).min() > 0.2
+
+
 def test_a_function_of_another_size_is_a_task():
     def ditch(rng, difficulty):
         heights = np.zeros((80, 30))
