@@ -561,6 +561,9 @@ def waves(rng, difficulty):
     return 0.6 * difficulty * swell * _taper(1.6)
 
 
+for _task in (obstacles, poles, corridors, walls, rooms, mazes, screens, traps):
+    _task.fence = True  # walls all around: who looks for a way must not fall off the world
+
 PILLAR_TASKS = {
     task.__name__: task
     for task in (
@@ -594,6 +597,8 @@ def make_terrain(task, rng, difficulty):
         pad = round(PAD * L / cell)
         for strip in (heights[:pad], heights[-pad:]):
             strip[:] = np.median(strip)
+        if getattr(generate, "fence", False):
+            heights[[0, -1]], heights[:, [0, -1]] = _wall(difficulty), _wall(difficulty)
         ground = Ground(heights, (cell, cell))
         length = ground.size[0]
         # From either end, in turn with wherever else a robot can stand: in a maze, on a ridge.
