@@ -199,7 +199,8 @@ class LocoEnv(gymnasium.Env):
 
     ## Reward
     (d_{t-1} - d_t) / dt, the velocity toward the goal, m/s. The paper prints the opposite sign but
-    calls it the velocity toward the target.
+    calls it the velocity toward the target. d is straight, or in part the length of the shortest
+    way around what is too high to climb, which has no dead ends: (1 - way) straight + way shortest.
 
     ## Episode
     It terminates at the goal (base within 0.5 m) and in a fall (base tipped by over 60 degrees or
@@ -215,6 +216,7 @@ class LocoEnv(gymnasium.Env):
         difficulty: in [0, 1], or (low, high) to draw it from, once for each terrain.
         tg, lidar: the paper's ablations (section 3) leave one of them out.
         memory: whether the robot knows where it has been; False: the paper's state.
+        way: share of the shortest way in the reward, in [0, 1]; 0: the paper's reward.
         terrains: how many terrains of each task to build; Bullet never frees a mesh, so the pool
             is built once and episodes draw from it. A finished Terrain counts once.
         pool_seed: seeds the pool; `reset(seed=...)` seeds all else.
@@ -228,15 +230,17 @@ class LocoEnv(gymnasium.Env):
     metadata = {"render_modes": ["rgb_array"], "render_fps": round(1 / DT)}
 
     def __init__(self, tasks=None, difficulty=(0.0, 1.0), tg=True, lidar=True, memory=True,
-                 terrains=1, pool_seed=0, render_mode=None, gui=False):
+                 way=0.0, terrains=1, pool_seed=0, render_mode=None, gui=False):
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
         low, high = difficulty if np.size(difficulty) == 2 else (difficulty, difficulty)
         if not all(isinstance(d, Real) for d in (low, high)) or not 0 <= low <= high <= 1:
             raise ValueError(f"difficulty must be in [0, 1] or (low, high), got {difficulty}")
+        if not isinstance(way, Real) or not 0 <= way <= 1:
+            raise ValueError(f"way must be in [0, 1], got {way!r}")
         if not isinstance(terrains, int) or terrains < 1:
             raise ValueError(f"terrains must be a whole number of at least 1, got {terrains!r}")
-        self.render_mode, self.show_lidar = render_mode, False
+        self.render_mode, self.show_lidar, self.way = render_mode, False, way
         tasks = list(PILLAR_TASKS) if tasks is None else tasks
         tasks = tasks if isinstance(tasks, (list, tuple)) else [tasks]
         if not tasks:
@@ -354,7 +358,7 @@ class LocoEnv(gymnasium.Env):
             raise ValueError(f"options may be {known}, got {options}")
         self.index, self.terrain = index, self.pool[int(index)]
         terrain = self.terrain
-        route = options.get("route", rng.integers(len(terrain.starts)))
+        self.route = route = options.get("route", rng.integers(len(terrain.starts)))
         if route not in range(len(terrain.starts)):
             raise ValueError(f"route must be in range({len(terrain.starts)}), got {route!r}")
         self.origin = np.array([self.offsets[index], 0.0, 0.0])
@@ -381,7 +385,7 @@ class LocoEnv(gymnasium.Env):
             p.resetBasePositionAndOrientation(body, (0, 0, -1000), (0, 0, 0, 1))
         self._move_people()
         observation = self._observe()
-        self.start_distance = self.distance
+        self.start_distance, self.to_go = self.distance, self._to_go()
         if self.visual:
             p.resetBasePositionAndOrientation(self.flag, self.goal, (0, 0, 0, 1))
             dx, dy, _ = np.subtract(self.goal, self.position)
@@ -411,7 +415,7 @@ class LocoEnv(gymnasium.Env):
             self.collisions += self.touching and not before
             self._move_people()
 
-        before, self.steps = self.distance, self.steps + 1
+        before, to_go, self.steps = self.distance, self.to_go, self.steps + 1
         observation = self._observe(self.steps % LIDAR_EVERY == 0)
         if not math.hypot(self.distance, *self.rates) < EXPLODED:  # not: NaN compares to nothing
             p.removeBody(self.robot)
@@ -420,8 +424,17 @@ class LocoEnv(gymnasium.Env):
             return np.zeros_like(observation), 0.0, True, False, self._info(False, True)
         success = self.distance < GOAL_RADIUS
         fall = self.up < FALL_UP or self.velocity[2] < -FALL_SPEED
-        reward = (before - self.distance) / DT
+        self.to_go = self._to_go()
+        reward = (to_go - self.to_go) / DT
         return observation, reward, success or fall, False, self._info(success, fall)
+
+    def _to_go(self):
+        """The distance that the reward counts, m."""
+        if self.way == 0:
+            return self.distance
+        x, y, _ = self.position
+        to_go = self.terrain.to_go(self.route, x - self.origin[0], y)
+        return (1 - self.way) * self.distance + self.way * to_go
 
     def _info(self, success, fall):
         progress = 1.0 if success else 1.0 - self.distance / self.start_distance
@@ -554,8 +567,9 @@ def train(args):
             load_checkpoint(run_dir / "checkpoint.pt")  # a bad one is better named by one process
         return launch(args)
     options = {"tg": args.tg, "lidar": args.lidar, "memory": args.memory}
-    meta = {**options, "tasks": args.tasks, "sequential": args.sequential, "seed": args.seed,
-            "command": "python loco_mtrl.py " + " ".join(args.argv), "commit": _commit()}
+    meta = {**options, "way": args.way, "tasks": args.tasks, "sequential": args.sequential,
+            "seed": args.seed, "command": "python loco_mtrl.py " + " ".join(args.argv),
+            "commit": _commit()}
     # Tasks, share of all steps done at the end, steps of a rollout, gamma, largest std of noise.
     # A detour pays after many seconds: 200 steps, 1 / (1 - 0.995), are 6.7 s, and later it is 17 s.
     if args.sequential:  # one task after the other (section 3), each for as long
@@ -579,7 +593,8 @@ def train(args):
                 gamma=gamma, learning_rate=5e-4, target_kl=0.015,
                 max_std=max_std,
             )
-            make_env = functools.partial(training_env, seed=args.seed, tasks=tasks, **options)
+            make_env = functools.partial(training_env, seed=args.seed, tasks=tasks, way=args.way,
+                                         **options)
             learn(make_env, config, run_dir=run_dir, resume=resume, mirror=mirror, meta=meta,
                   episode_keys=("t_cr", "success", "fall", "exploded"), groups=args.tasks,
                   on_update=on_update)
@@ -913,6 +928,16 @@ def _whole(least):
     return parse
 
 
+def _share(text):
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1.0
+    if not 0 <= value <= 1:
+        raise argparse.ArgumentTypeError(f"must be in [0, 1], got {text!r}")
+    return value
+
+
 def mesh_options(p):
     p.add_argument("--mesh", metavar="FILE.obj", help="a scanned building instead")
     p.add_argument("--scale", type=float, default=1.0, help="of the mesh, metres a unit")
@@ -933,6 +958,8 @@ def parse(argv):
     p.add_argument("--no-lidar", dest="lidar", action="store_false", help="blind policy")
     p.add_argument("--no-memory", dest="memory", action="store_false",
                    help="policy that does not know where it has been, as in the paper")
+    p.add_argument("--way", type=_share, default=0.0, help="share of the shortest way around walls "
+                   "in the reward; 0, the default: straight to the goal, as in the paper")
     p.add_argument("--sequential", action="store_true", help="one task after the other, not mixed")
     p.add_argument("--seed", type=_whole(0), default=0)
     p.add_argument("--run-dir", default="runs/main", help="(default %(default)s)")

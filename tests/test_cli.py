@@ -159,6 +159,9 @@ def test_play_writes_a_gif_that_moves_and_a_map(trained):
         (["train", "--seed", "1e999"], "1e999"),
         (["train", "--steps", "2.5"], "2.5"),
         (["train", "--fast"], "--fast"),
+        (["train", "--way", "2"], "'2'"),
+        (["train", "--way", "nan"], "nan"),
+        (["train", "--way", "short"], "short"),
         (["train", "--resume", "--run-dir", "nowhere"], "nowhere"),
         (["train", "--run-dir", "/proc/nowhere", "--ranks", "1"], "/proc/nowhere"),
         (["eval"], "POLICY"),
@@ -195,7 +198,7 @@ def test_wrong_checkpoints_are_named(trained, tmp_path, capsys):
     torch.save({"model": 1}, tmp_path / "other.pt")
     model = ppo.ActorCritic(obs_dim=7, act_dim=2)
     ppo.save_checkpoint(tmp_path / "sizes.pt", model, ppo.PPOConfig(), meta={
-        "tg": True, "lidar": True, "tasks": ["flat"], "sequential": False})  # fmt: skip
+        "tg": True, "lidar": True, "memory": True, "tasks": ["flat"], "sequential": False})  # fmt: skip
     for name in ("cut", "text", "code", "other", "sizes"):
         assert loco_mtrl.main(["eval", str(tmp_path / f"{name}.pt")]) == 2
         error = capsys.readouterr().err
