@@ -14,6 +14,7 @@ import math
 import multiprocessing
 import operator
 import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -605,7 +606,9 @@ def train(args):
         return 130
     if int(os.environ.get("RANK", 0)) == 0:
         checkpoint = load_checkpoint(run_dir / "checkpoint.pt")
-        checkpoint["optimiser"] = None
+        checkpoint["optimiser"] = None  # to be shared: half the digits say where to step as well
+        checkpoint["model"] = {name: tensor.half() if tensor.dtype == torch.float32 else tensor
+                               for name, tensor in checkpoint["model"].items()}
         torch.save(checkpoint, run_dir / "policy.pt")
         print(f"Policy: {run_dir / 'policy.pt'}   Curve: {run_dir / 'curve.png'}")
     return 0
@@ -637,10 +640,13 @@ def launch(args):
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # what torchrun would set, with a warning
     try:
         torchrun.main(["--standalone", f"--nproc-per-node={args.ranks}", __file__, *args.argv])
-    except SignalException as signal:
-        return 128 + signal.sigval
+    except SignalException as stop:
+        return 128 + stop.sigval
     except ChildFailedError as error:
-        rank, failure = error.get_first_failure()
+        # The launcher ends the other ranks by SIGTERM, and may record that as the first failure.
+        failures = {rank: failure for rank, failure in error.failures.items()
+                    if failure.exitcode != -signal.SIGTERM} or error.failures
+        rank, failure = min(failures.items(), key=lambda item: item[1].timestamp)
         if failure.exitcode > 0:
             return failure.exitcode  # the rank itself has said what is wrong
         print(f"loco_mtrl.py: error: rank {rank} was killed by signal {-failure.exitcode}. "

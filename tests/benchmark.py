@@ -110,7 +110,7 @@ def main():
     env.close()
     inside = sum(spent.values()) / STEPS
     naive, _ = walk(NaiveEnv("rugged", difficulty=0.5), 200)
-    rows.append(("steps/s on one core, rugged pillars, 160 rays", f"{1 / step:.0f}"))
+    rows.append(("steps/s on one core, rugged pillars, 240 rays", f"{1 / step:.0f}"))
     for name, seconds in spent.items():
         rows.append((f"  ms a step in {name}", f"{seconds / STEPS * 1e3:.3f}"))
     rows.append(("  share inside those two", f"{inside / measured:.2f}"))
