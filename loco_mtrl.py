@@ -118,11 +118,12 @@ LIDAR_EVERY = 2  # control steps from one scan to the next: it turns at 15 Hz, a
 LIDAR_FRONT, LIDAR_REAR = (0.36, 0.0, 0.08), (-0.38, 0.0, 0.08)  # m, of the two sensors
 # Degrees. Steep rays see the ground that the front feet are about to meet, level ones see walls.
 LIDAR_ELEVATIONS = (-84, -70, -57, -45, -34, -25, -17, -10, -3, 8)
-# Columns on the left, from ahead to behind, densest ahead; and the first one on the right. Each row
-# is turned outwards by 0, 1 or 2 thirds of the way to the next column: together, three rows see
-# poles that would slip through one.
+# The columns on the left, from ahead to behind, densest ahead, then the first of the right side.
+# Each row is turned outwards by 0, 1 or 2 thirds of the way to the next column: together, three
+# rows see poles that would slip through one.
 _COLUMNS = (4, 12, 21, 31, 42, 54, 68, 84, 105, 130, 155, 175, 185)
-_LEFT = [np.interp(np.arange(12) + k % 3 / 3, np.arange(13), _COLUMNS) for k in range(10)]
+_LEFT = [np.interp(np.arange(12) + row % 3 / 3, np.arange(13), _COLUMNS)
+         for row in range(len(LIDAR_ELEVATIONS))]
 LIDAR_AZIMUTHS = np.array([[*left[::-1], *-left] for left in _LEFT])  # degrees, (rows, columns)
 N_RAYS = LIDAR_AZIMUTHS.size
 HIT_FRACTION = operator.itemgetter(2)  # of the range, in what rayTestBatch gives for a ray
@@ -143,9 +144,9 @@ def lidar_rays():
 # Memory: how many of the last MEMORY seconds were spent within a metre of each of these points (m,
 # in the base frame), the nearer the more. A near and a far row of them, along the scan's columns.
 MEMORY, MEMORY_RADII = 40, (0.7, 2.0)
-_WAYS = np.radians(LIDAR_AZIMUTHS[0])
-MEMORY_POINTS = np.concatenate(
-    [radius * np.stack([np.cos(_WAYS), np.sin(_WAYS)], 1) for radius in MEMORY_RADII])  # (48, 2)
+_LEFTWARD = np.radians(LIDAR_AZIMUTHS[0])
+_AROUND = np.stack([np.cos(_LEFTWARD), np.sin(_LEFTWARD)], 1)
+MEMORY_POINTS = np.concatenate([radius * _AROUND for radius in MEMORY_RADII])  # (48, 2)
 
 
 # ------------------------------------------------------------------------------- the environment
@@ -416,12 +417,13 @@ class LocoEnv(gymnasium.Env):
             self.collisions += self.touching and not before
             self._move_people()
 
-        before, to_go, self.steps = self.distance, self.to_go, self.steps + 1
+        self.steps += 1
+        distance, to_go = self.distance, self.to_go
         observation = self._observe(self.steps % LIDAR_EVERY == 0)
         if not math.hypot(self.distance, *self.rates) < EXPLODED:  # not: NaN compares to nothing
             p.removeBody(self.robot)
             self._load_robot()
-            self.distance, self.exploded = before, True
+            self.distance, self.exploded = distance, True
             return np.zeros_like(observation), 0.0, True, False, self._info(False, True)
         success = self.distance < GOAL_RADIUS
         fall = self.up < FALL_UP or self.velocity[2] < -FALL_SPEED
@@ -520,7 +522,7 @@ class LocoEnv(gymnasium.Env):
         legs = np.arange(12).reshape(4, 3)[[1, 0, 3, 2]].ravel()  # joint angles mirror unsigned
         swap = np.array([1, 0, 3, 2])
         parameters = np.array([0, 2, 1, 3, 4])  # left and right stride change places
-        scan = np.arange(math.prod(self.scan_shape)).reshape(self.scan_shape)[:, ::-1].ravel()
+        scan = np.arange(self.scan.size).reshape(self.scan_shape)[:, ::-1].ravel()
         parts, signs = [scan, np.arange(5), legs, legs], np.ones(self.observation_space.shape)
         signs[scan.size + np.array([1, 2, 4])] = -1  # heading, roll rate, yaw rate
         actions = [legs]
@@ -591,8 +593,7 @@ def train(args):
                 num_minibatches=min(num_steps // 50, 10), update_epochs=3, seed=args.seed,
                 checkpoint_every=10_000 // num_steps, exteroceptive=scan,
                 encoder_hidden=(128, 128), trunk_hidden=(128, 128),
-                gamma=gamma, learning_rate=5e-4, target_kl=0.015,
-                max_std=max_std,
+                gamma=gamma, learning_rate=5e-4, target_kl=0.015, max_std=max_std,
             )
             make_env = functools.partial(training_env, seed=args.seed, tasks=tasks, way=args.way,
                                          **options)
@@ -606,7 +607,8 @@ def train(args):
         return 130
     if int(os.environ.get("RANK", 0)) == 0:
         checkpoint = load_checkpoint(run_dir / "checkpoint.pt")
-        checkpoint["optimiser"] = None  # to be shared: half the digits say where to step as well
+        # To be shared: half the bits change an action by less than a thousandth.
+        checkpoint["optimiser"] = None
         checkpoint["model"] = {name: tensor.half() if tensor.dtype == torch.float32 else tensor
                                for name, tensor in checkpoint["model"].items()}
         torch.save(checkpoint, run_dir / "policy.pt")
@@ -696,7 +698,7 @@ def zero_action(observation, env):
 def walk_straight(observation, env):
     """Walks straight at the goal on the same trajectory generator: steers, but sees nothing."""
     action = np.zeros(env.action_space.shape)
-    heading = observation[math.prod(env.unwrapped.scan_shape) + 1]
+    heading = observation[env.unwrapped.scan.size + 1]
     action[1:3] = 0.27 + np.clip(heading, -0.6, 0.6) * np.array([-0.67, 0.67])  # two strides
     return action
 

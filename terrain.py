@@ -615,6 +615,8 @@ def make_terrain(task, rng, difficulty):
 
     task: a name in PILLAR_TASKS, a function (rng, difficulty) -> heights (m, n) in m, or a
     finished Terrain, which is returned as it is. rng: numpy Generator; difficulty: in [0, 1].
+    A function may have attributes: `cell`, m, the pillars' cross-section if it is not L; `tilt`,
+    rad at difficulty 1 (Terrain.tilt); `fence`, walls along the border that grow with difficulty.
     The strips at both ends are made level, for the episodes to start there; goals lie 6-9 m away.
     Raises ValueError for an unknown task, a difficulty outside [0, 1], heights that are not a
     finite 2-D array, and a task that yields no route in TRIES draws.
@@ -628,8 +630,7 @@ def make_terrain(task, rng, difficulty):
     generate = task if callable(task) else PILLAR_TASKS[task]
     name, cell = getattr(generate, "__name__", "terrain"), getattr(generate, "cell", L)
     for _ in range(TRIES):
-        heights = np.array(generate(rng, difficulty), float)
-        mesh = fuse_pillars(heights, cell, cell)
+        heights = _heights(generate(rng, difficulty), 1, (cell, cell)).copy()
         pad = round(PAD * L / cell)
         for strip in (heights[:pad], heights[-pad:]):
             strip[:] = np.median(strip)
