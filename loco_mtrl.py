@@ -164,6 +164,9 @@ RESIDUAL = {True: 0.25, False: 0.6}  # rad, largest u_fb with the TG, and withou
 GOAL_RADIUS = 0.5  # m, r_g
 BASE_HEIGHT = 0.30  # m, of the walking base: a goal floats that high over the ground
 EXPLODED = 1e3  # m or rad/s
+# Without it, running up to an edge earns as much as stopping there, and only who has first learned
+# to stop lives to find the way along it.
+FALL_COST = 2.0  # m of progress
 FALL_UP, FALL_SPEED = 0.5, 2.5  # fallen: tipped by over 60 degrees, or dropping faster (m/s)
 MAX_EPISODE_STEPS = 900  # 30 s
 PICTURE = (400, 300)  # pixels
@@ -180,7 +183,7 @@ def _about_z(yaw):
 class LocoEnv(gymnasium.Env):
     """A Laikago walks to a goal over terrain that only its LiDAR shows it (section 2).
 
-    ## Observation: Box((330,), float32), in the order of section 2.1
+    ## Observation: Box((332,), float32), in the order of section 2.1
     | entries | meaning | unit |
     |---|---|---|
     | 240 | r, LiDAR scan: distance / 3 m, 1 = nothing hit; rows from low to high, left to right | |
@@ -188,11 +191,12 @@ class LocoEnv(gymnasium.Env):
     | 1 | g_d, distance to the goal | m |
     | 1 | g_h, heading of the goal relative to the robot's, left positive | rad |
     | 3 | angular rates of the base in its own frame (IMU) | rad/s |
+    | 2 | tilt: where down is, its forward and left share in the base frame (IMU); ours | |
     | 12 | q, joint angles: FR, FL, RR, RL x abduction, hip, knee | rad |
     | 12 | a_{t-1}, joint targets commanded in the previous step | rad |
     | 13 | s_tg, state of the trajectory generator; none with tg=False | |
-    As in the paper it holds neither roll and pitch nor the task. The scan and the memory are taken
-    at 15 Hz, all else at 30 Hz; lidar=False and memory=False leave them out.
+    The paper's robot knows neither its tilt nor where it has been: paper=True leaves both out, and
+    lidar=False the scan. Scan and memory are taken at 15 Hz, all else at 30 Hz.
 
     ## Action: Box(-1, 1, (17,), float32), clipped to that range, then smoothed
     5 parameters of the trajectory generator (`tg.PARAMETERS`), then the 12 residuals u_fb;
@@ -203,6 +207,7 @@ class LocoEnv(gymnasium.Env):
     (d_{t-1} - d_t) / dt, the velocity toward the goal, m/s. The paper prints the opposite sign but
     calls it the velocity toward the target. d is straight, or in part the length of the shortest
     way around what is too high to climb, which has no dead ends: (1 - way) straight + way shortest.
+    A fall costs 2 m / dt, which is ours; with paper=True nothing, as in the paper.
 
     ## Episode
     It terminates at the goal (base within 0.5 m) and in a fall (base tipped by over 60 degrees or
@@ -217,7 +222,7 @@ class LocoEnv(gymnasium.Env):
             of these; None: all pillar tasks. Each episode draws one; the policy is not told which.
         difficulty: in [0, 1], or (low, high) to draw it from, once for each terrain.
         tg, lidar: the paper's ablations (section 3) leave one of them out.
-        memory: whether the robot knows where it has been; False: the paper's state.
+        paper: the paper's own state and reward: no memory, no tilt, no cost of a fall.
         way: share of the shortest way in the reward, in [0, 1]; 0: the paper's reward.
         terrains: how many terrains of each task to build; Bullet never frees a mesh, so the pool
             is built once and episodes draw from it. A finished Terrain counts once.
@@ -231,7 +236,7 @@ class LocoEnv(gymnasium.Env):
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": round(1 / DT)}
 
-    def __init__(self, tasks=None, difficulty=(0.0, 1.0), tg=True, lidar=True, memory=True,
+    def __init__(self, tasks=None, difficulty=(0.0, 1.0), tg=True, lidar=True, paper=False,
                  way=0.0, terrains=1, pool_seed=0, render_mode=None, gui=False):
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
@@ -253,12 +258,13 @@ class LocoEnv(gymnasium.Env):
         self.generator = TrajectoryGenerator() if tg else None
         self._connect(gui)
         rows, columns = LIDAR_AZIMUTHS.shape
-        self.scan_shape = rows * lidar + len(MEMORY_RADII) * memory, columns
-        self.lidar, self.memory = lidar, memory
+        self.scan_shape = rows * lidar + len(MEMORY_RADII) * (not paper), columns
+        self.lidar, self.paper = lidar, paper
         n_scan = math.prod(self.scan_shape)
         self.scan = np.zeros(n_scan, np.float32)
         # Generous bounds: what lies beyond them is no longer a robot, and the episode ends.
-        high = [1e3, np.pi] + [1e3] * 3 + [1e2] * 24 + [1.0] * TrajectoryGenerator.state_size * tg
+        high = [1e3, np.pi] + [1e3] * 3 + [1.0] * 2 * (not paper) + [1e2] * 24
+        high += [1.0] * TrajectoryGenerator.state_size * tg
         low = np.concatenate([np.zeros(n_scan + 1), np.negative(high[1:])])
         high = np.concatenate([np.ones(n_scan), high])
         self.observation_space = gymnasium.spaces.Box(*np.float32([low, high]))
@@ -373,8 +379,9 @@ class LocoEnv(gymnasium.Env):
             self.generator.reset(rng.uniform(0, 2 * np.pi))
             self.target = self.generator.step(np.zeros(self.generator.action_size), 0.0)
         way, level = rng.uniform(0, 2 * math.pi), GRAVITY * math.sin(terrain.tilt)
-        down = -GRAVITY * math.cos(terrain.tilt)
-        p.setGravity(level * math.cos(way), level * math.sin(way), down)
+        self.gravity = (level * math.cos(way), level * math.sin(way),
+                        -GRAVITY * math.cos(terrain.tilt))
+        p.setGravity(*self.gravity)
         self.action = np.zeros(self.action_space.shape)
         position = self.origin + [x, y, z + BASE_HEIGHT + 0.02]
         p.resetBasePositionAndOrientation(self.robot, position, _about_z(yaw))
@@ -428,7 +435,8 @@ class LocoEnv(gymnasium.Env):
         success = self.distance < GOAL_RADIUS
         fall = self.up < FALL_UP or self.velocity[2] < -FALL_SPEED
         self.to_go = self._to_go()
-        reward = (to_go - self.to_go) / DT
+        cost = FALL_COST if fall and not success and not self.paper else 0.0
+        reward = (to_go - self.to_go - cost) / DT
         return observation, reward, success or fall, False, self._info(success, fall)
 
     def _to_go(self):
@@ -463,6 +471,9 @@ class LocoEnv(gymnasium.Env):
         state = [self.distance, (heading + math.pi) % (2 * math.pi) - math.pi]
         wx, wy, wz = self.rates
         state += [r[i] * wx + r[3 + i] * wy + r[6 + i] * wz for i in range(3)]
+        if not self.paper:
+            gx, gy, gz = self.gravity
+            state += [(r[i] * gx + r[3 + i] * gy + r[6 + i] * gz) / GRAVITY for i in range(2)]
         state += [joint[0] for joint in p.getJointStates(self.robot, self.joints)]
         state += self.target.tolist()
         if self.generator:
@@ -473,7 +484,7 @@ class LocoEnv(gymnasium.Env):
             self.hits = p.rayTestBatch(*self._rays, parentObjectUniqueId=self.robot,
                                        parentLinkIndex=-1, collisionFilterMask=STATIC_GROUP)
             self.scan[:N_RAYS] = list(map(HIT_FRACTION, self.hits))
-        if turn_lidar and self.memory:
+        if turn_lidar and not self.paper:
             self.scan[self.scan.size - len(MEMORY_POINTS) :] = self._been_there(r)
         observation[: self.scan.size] = self.scan
         return observation
@@ -523,8 +534,10 @@ class LocoEnv(gymnasium.Env):
         swap = np.array([1, 0, 3, 2])
         parameters = np.array([0, 2, 1, 3, 4])  # left and right stride change places
         scan = np.arange(self.scan.size).reshape(self.scan_shape)[:, ::-1].ravel()
-        parts, signs = [scan, np.arange(5), legs, legs], np.ones(self.observation_space.shape)
-        signs[scan.size + np.array([1, 2, 4])] = -1  # heading, roll rate, yaw rate
+        base = np.arange(5 if self.paper else 7)
+        parts, signs = [scan, base, legs, legs], np.ones(self.observation_space.shape)
+        # heading, roll rate, yaw rate, tilt to the left
+        signs[scan.size + np.array([1, 2, 4] if self.paper else [1, 2, 4, 6])] = -1
         actions = [legs]
         if self.generator:
             parts += [swap, swap, parameters]
@@ -547,7 +560,7 @@ if "LocoMTRL-v0" not in gymnasium.registry:  # run as a script, this file is imp
 # ------------------------------------------------------------------------------- train
 
 REWARD_SCALE = 0.1  # keeps the critic's targets near 1; the environment's own reward is the paper's
-MAIN_STEPS = 3_000_000  # of the no-argument run
+MAIN_STEPS = 3_300_000  # of the no-argument run
 # Short rollouts learn fastest at first; later the noise of so few samples holds the policy back.
 # And a policy is judged without the exploration noise, which has freed it wherever it was stuck: so
 # the last part of the training has little of it.
@@ -569,7 +582,7 @@ def train(args):
         if args.resume:
             load_checkpoint(run_dir / "checkpoint.pt")  # a bad one is better named by one process
         return launch(args)
-    options = {"tg": args.tg, "lidar": args.lidar, "memory": args.memory}
+    options = {"tg": args.tg, "lidar": args.lidar, "paper": args.paper}
     meta = {**options, "way": args.way, "tasks": args.tasks, "sequential": args.sequential,
             "seed": args.seed, "command": "python loco_mtrl.py " + " ".join(args.argv),
             "commit": _commit()}
@@ -584,16 +597,20 @@ def train(args):
                   (args.tasks, 1.0, 1024, 0.998, QUIET_STD)]
     with contextlib.closing(LocoEnv("flat", **options)) as env:
         mirror, scan = env.mirror(), env.scan_shape
+    n_tg = TrajectoryGenerator.action_size * args.tg
+    init_std = (0.37,) * n_tg + (0.25,) * 12
+    noise_correlation = (0.9,) * n_tg + (0.0,) * 12  # 0.3 s: turns and stops are tried as such
     restarted = os.environ.get("TORCHELASTIC_RESTART_COUNT", "0") != "0"  # torchrun, after a crash
     resume, on_update = args.resume or restarted, tensorboard(run_dir) if args.tensorboard else None
     try:
         for tasks, share, num_steps, gamma, max_std in stages:  # each resumes the one before
             config = PPOConfig(
                 total_timesteps=round(share * args.steps), num_envs=10, num_steps=num_steps,
-                num_minibatches=min(num_steps // 50, 10), update_epochs=3, seed=args.seed,
+                num_minibatches=min(num_steps // 50, 10), update_epochs=2, seed=args.seed,
                 checkpoint_every=10_000 // num_steps, exteroceptive=scan,
                 encoder_hidden=(128, 128), trunk_hidden=(128, 128),
-                gamma=gamma, learning_rate=5e-4, target_kl=0.015, max_std=max_std,
+                init_std=init_std, noise_correlation=noise_correlation,
+                gamma=gamma, learning_rate=5e-4, target_kl=0.05, max_std=max_std,
             )
             make_env = functools.partial(training_env, seed=args.seed, tasks=tasks, way=args.way,
                                          **options)
@@ -699,7 +716,7 @@ def walk_straight(observation, env):
     """Walks straight at the goal on the same trajectory generator: steers, but sees nothing."""
     action = np.zeros(env.action_space.shape)
     heading = observation[env.unwrapped.scan.size + 1]
-    action[1:3] = 0.27 + np.clip(heading, -0.6, 0.6) * np.array([-0.67, 0.67])  # two strides
+    action[1:3] = 0.6 + np.clip(heading, -0.6, 0.6) * np.array([-0.7, 0.7])  # two strides
     return action
 
 
@@ -715,9 +732,9 @@ def load_actor(name):
         return REFERENCES[name], {}, None
     model, checkpoint = load_policy(name)
     meta = checkpoint["meta"]
-    if not {"tg", "lidar", "memory", "tasks", "sequential"} <= set(meta):
+    if not {"tg", "lidar", "paper", "tasks", "sequential"} <= set(meta):
         raise ValueError(f"{name} is not a policy for LocoEnv: {meta}")
-    options, tasks, row = {k: meta[k] for k in ("tg", "lidar", "memory")}, meta["tasks"], "ours"
+    options, tasks, row = {k: meta[k] for k in ("tg", "lidar", "paper")}, meta["tasks"], "ours"
     with contextlib.closing(LocoEnv("flat", **options)) as env:
         size, given = env.observation_space.shape[0], model.kwargs["obs_dim"]
     if size != given:
@@ -964,8 +981,9 @@ def parse(argv):
                    help="comma-separated; default: all %(default)s")
     p.add_argument("--no-tg", dest="tg", action="store_false", help="reactive policy")
     p.add_argument("--no-lidar", dest="lidar", action="store_false", help="blind policy")
-    p.add_argument("--no-memory", dest="memory", action="store_false",
-                   help="policy that does not know where it has been, as in the paper")
+    p.add_argument("--paper", action="store_true",
+                   help="the paper's own state and reward: the robot knows neither its tilt nor "
+                   "where it was, and a fall costs nothing")
     p.add_argument("--way", type=_share, default=0.0, help="share of the shortest way around walls "
                    "in the reward; 0, the default: straight to the goal, as in the paper")
     p.add_argument("--sequential", action="store_true", help="one task after the other, not mixed")

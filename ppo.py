@@ -50,6 +50,9 @@ class PPOConfig:
     target_kl: float = 0.01  # nats by which one update should move the policy
     init_std: float | tuple[float, ...] = 0.37  # of the exploration noise; or one per action entry
     max_std: float = 10.0  # upper bound of that noise at any time
+    # Share of that noise that lives on to the next step, again one or one per action entry. White
+    # noise (0) is thirty small nudges a second that cancel out; noise that lasts tries out turns.
+    noise_correlation: float | tuple[float, ...] = 0.0
     exteroceptive: tuple[int, int] = (0, 0)  # rows, columns of a scan that leads the observation
     encoder_hidden: tuple[int, ...] = (128, 64)  # layer widths of each encoder
     trunk_hidden: tuple[int, ...] = (64, 64)  # layer widths after the encoders
@@ -68,8 +71,9 @@ class PPOConfig:
             elif name.endswith("_hidden"):
                 good = len(value) > 0 and all(isinstance(w, int) and w >= 1 for w in value)
                 check(name, good, "a non-empty tuple of whole numbers of at least 1")
-            elif name in ("gamma", "gae_lambda"):
-                check(name, 0 <= value <= 1, "in [0, 1]")
+            elif name in ("gamma", "gae_lambda", "noise_correlation"):
+                values = value if isinstance(value, tuple) else (value,)
+                check(name, values and all(0 <= v <= 1 for v in values), "in [0, 1]")
             elif isinstance(getattr(PPOConfig, name), int):
                 least = 0 if name == "seed" else 1
                 good = isinstance(value, int) and value >= least
@@ -244,10 +248,9 @@ class ActorCritic(nn.Module):
         return (-0.5 * z**2 - log_std - 0.5 * math.log(2 * math.pi)).sum(-1)
 
     @torch.no_grad()
-    def act(self, obs, generator=None):
-        """Draw an action for each row: (..., obs) -> (..., act). Not clipped to the space."""
-        mean = self.mean(obs)
-        return mean + self.log_std().exp() * torch.randn(mean.shape, generator=generator)
+    def act(self, obs, noise):
+        """Actions for `noise`, standard normal: (..., obs), (..., act) -> (..., act); unclipped."""
+        return self.mean(obs) + self.log_std().exp() * noise
 
     @torch.no_grad()
     def mean_action(self, obs):
@@ -489,9 +492,18 @@ def learn(make_env, config, *, run_dir=None, resume=False, mirror=None, init=Non
     the same bits as never having stopped (with as many ranks, and envs that reset(seed) defines).
 
     The first Ctrl-C stops after the running update, writes a checkpoint and raises
-    KeyboardInterrupt; a second one aborts. Raises ValueError if the env does not fit,
-    FloatingPointError if the parameters stop being numbers, and what `open_run` raises.
+    KeyboardInterrupt; a second one aborts. Raises ValueError if an argument is wrong or the env
+    does not fit, FloatingPointError if the parameters stop being numbers, and what `open_run`
+    raises.
     """
+    for name, good, valid in (
+        ("resume", not resume or run_dir is not None, "False where there is no run_dir"),
+        ("init", init is None or isinstance(init, ActorCritic), "an ActorCritic"),
+        ("episode_keys", not isinstance(episode_keys, str), "several names"),
+        ("groups", not isinstance(groups, str), "several names"),
+    ):
+        if not good:
+            raise ValueError(f"{name} = {locals()[name]!r}, but it must be {valid}")
     torch.set_num_threads(1)  # nets this small only lose by more
     if int(os.environ.get("WORLD_SIZE", 1)) > 1 and not dist.is_initialized():
         store, rank, world = next(dist.rendezvous("env://"))
@@ -517,6 +529,7 @@ def learn(make_env, config, *, run_dir=None, resume=False, mirror=None, init=Non
         return build_policy(checkpoint)  # nothing left to learn
 
     num_steps, num_envs = config.num_steps, config.num_envs
+    kept = torch.tensor(config.noise_correlation)  # share of the noise
     first = rank * num_envs
     envs = gym.vector.SyncVectorEnv([partial(make_env, first + i) for i in range(num_envs)])
     obs_space, act_space = envs.single_observation_space, envs.single_action_space
@@ -533,6 +546,9 @@ def learn(make_env, config, *, run_dir=None, resume=False, mirror=None, init=Non
             model = ActorCritic(**dims, exteroceptive=config.exteroceptive, mirror=mirror,
                                 encoder_hidden=config.encoder_hidden,
                                 trunk_hidden=config.trunk_hidden, init_std=config.init_std)
+    if kept.ndim and len(kept) != dims["act_dim"]:
+        raise ValueError(f"noise_correlation has {len(kept)} entries, but an action has "
+                         f"{dims['act_dim']}")
     for name, size in dims.items():
         if model.kwargs[name] != size:
             raise ValueError(f"policy has {name} = {model.kwargs[name]}, but the env has {size}")
@@ -575,12 +591,16 @@ def learn(make_env, config, *, run_dir=None, resume=False, mirror=None, init=Non
                 torch_seed, *env_seeds = seeds.generate_state(num_envs + 1, np.uint64).tolist()
                 generator.manual_seed(torch_seed)
                 next_obs, _ = envs.reset(seed=env_seeds)
+                noise = torch.randn(num_envs, dims["act_dim"], generator=generator)
                 ended, returned, fresh = np.zeros(num_envs, bool), np.zeros(num_envs), False
 
             for t in range(num_steps):
                 obs[t] = torch.from_numpy(next_obs).flatten(1)
                 prev_done[t] = torch.from_numpy(ended)
-                actions[t] = model.act(obs[t], generator)
+                # Each action by itself is still drawn from the policy, so the loss stays the same.
+                fresh_noise = torch.randn(noise.shape, generator=generator)
+                noise = kept * noise + (1 - kept**2).sqrt() * fresh_noise
+                actions[t] = model.act(obs[t], noise)
                 command = actions[t].numpy().reshape(envs.action_space.shape)
                 command = command.clip(act_space.low, act_space.high).astype(act_space.dtype)
                 next_obs, reward, terminal, truncated, info = envs.step(command)

@@ -197,7 +197,7 @@ def test_wrong_checkpoints_are_named(trained, tmp_path, capsys):
     (tmp_path / "code.pt").write_bytes(pickle.dumps(os.system))
     torch.save({"model": 1}, tmp_path / "other.pt")
     model = ppo.ActorCritic(obs_dim=7, act_dim=2)
-    meta = {"tg": True, "lidar": True, "memory": True, "tasks": ["flat"], "sequential": False}
+    meta = {"tg": True, "lidar": True, "paper": False, "tasks": ["flat"], "sequential": False}
     ppo.save_checkpoint(tmp_path / "sizes.pt", model, ppo.PPOConfig(), meta=meta)
     for name in ("cut", "text", "code", "other", "sizes"):
         assert loco_mtrl.main(["eval", str(tmp_path / f"{name}.pt")]) == 2

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from contextlib import closing
 
 import gymnasium
 import numpy as np
@@ -49,7 +50,7 @@ def place(env, x, y, z, yaw=0.0, roll=0.0):
     return env._observe()
 
 
-@pytest.mark.parametrize("options", [{}, {"tg": False}, {"lidar": False}, {"memory": False}])
+@pytest.mark.parametrize("options", [{}, {"tg": False}, {"lidar": False}, {"paper": True}])
 def test_gymnasium_checks_pass_without_a_warning(options):
     env = gymnasium.make("LocoMTRL-v0", tasks="rugged", render_mode="rgb_array", **options)
     check_env(env.unwrapped)
@@ -58,12 +59,13 @@ def test_gymnasium_checks_pass_without_a_warning(options):
 
 def test_observation_has_the_papers_parts_in_its_order(flat):
     observation, _ = flat.reset(seed=3)
-    scan, goal, rates, joints, target, s_tg = np.split(
-        observation, np.cumsum([N_SCAN, 2, 3, 12, 12])
+    scan, goal, rates, tilt, joints, target, s_tg = np.split(
+        observation, np.cumsum([N_SCAN, 2, 3, 2, 12, 12])
     )
     assert scan.min() >= 0 and scan.max() <= 1
     assert goal[0] == pytest.approx(np.linalg.norm(np.subtract(flat.goal, flat.position)))
     np.testing.assert_allclose(rates, 0, atol=1e-6)
+    np.testing.assert_allclose(tilt, 0, atol=1e-6)
     np.testing.assert_allclose(joints, target, atol=1e-6)  # an episode starts in the TG's pose
     np.testing.assert_allclose(s_tg, flat.generator.state(), atol=1e-6)
 
@@ -83,6 +85,19 @@ def test_imu_gives_rates_in_the_frame_of_the_base(flat):
     flat.bullet.resetBaseVelocity(flat.robot, (0, 0, 0), (1.0, 2.0, 3.0))
     rates = flat._observe()[N_SCAN + 2 : N_SCAN + 5]
     np.testing.assert_allclose(rates, [2.0, -1.0, 3.0], atol=1e-5)
+
+
+def test_imu_tells_where_down_is(flat):
+    flat.reset(seed=0)
+    place(flat, 6, 0, 0.5, yaw=1.0, roll=0.3)  # the left side is higher: down is to the right
+    tilt = flat._observe()[N_SCAN + 5 : N_SCAN + 7]
+    np.testing.assert_allclose(tilt, [0.0, -np.sin(0.3)], atol=1e-6)
+    level = terrain.make_terrain("inclines", np.random.default_rng(0), 1.0)  # gravity turns instead
+    with closing(LocoEnv(level)) as env:
+        env.reset(seed=0)
+        tilt = place(env, 6, 0, 0.5)[N_SCAN + 5 : N_SCAN + 7]
+        assert np.hypot(*tilt) == pytest.approx(np.sin(np.radians(30)), abs=1e-6)
+        np.testing.assert_allclose(tilt, np.divide(env.gravity[:2], 9.81), atol=1e-6)
 
 
 @settings(max_examples=20, deadline=None)
@@ -251,11 +266,15 @@ def test_success_ends_the_episode_at_the_goal(flat):
     assert info["success"] and not info["fall"] and info["t_cr"] == 1.0
 
 
-def test_tipping_over_is_a_fall(flat):
-    flat.reset(seed=0)
-    place(flat, 5, 0, 0.6, roll=1.4)
-    _, _, terminated, _, info = flat.step(np.zeros(17))
-    assert terminated and info["fall"] and not info["success"]
+@pytest.mark.parametrize(("paper", "cost"), [(False, 2.0), (True, 0.0)])
+def test_tipping_over_is_a_fall_and_costs_two_metres(paper, cost):
+    with closing(LocoEnv("flat", paper=paper)) as env:
+        env.reset(seed=0)
+        before = env.distance
+        place(env, *np.subtract(env.position, env.origin)[:2], 0.6, roll=1.4)
+        _, reward, terminated, _, info = env.step(np.zeros(17))
+        assert terminated and info["fall"] and not info["success"]
+        assert reward * DT == pytest.approx(before - env.distance - cost, abs=0.2)
 
 
 def test_dropping_off_an_edge_is_a_fall():
@@ -372,7 +391,7 @@ def test_any_finite_action_gives_an_observation_in_the_space(flat, action):
 
 
 def test_mirror_is_its_own_inverse_and_fits_the_spaces():
-    for options in ({}, {"tg": False}, {"lidar": False}, {"memory": False}):
+    for options in ({}, {"tg": False}, {"lidar": False}, {"paper": True}):
         env = LocoEnv("flat", **options)
         i, s, j, t = env.mirror()
         observation = np.arange(env.observation_space.shape[0], dtype=float)

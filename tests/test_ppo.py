@@ -6,6 +6,7 @@ import os
 import pickle
 import signal
 import socket
+from functools import partial
 
 import gymnasium as gym
 import numpy as np
@@ -158,8 +159,9 @@ def test_approx_kl_is_never_negative(new, old):
 def rollout(model, rows=64):
     generator = torch.Generator().manual_seed(1)
     obs = torch.randn(rows, model.kwargs["obs_dim"], generator=generator)
-    actions = model.act(obs, generator)
+    noise = torch.randn(rows, model.kwargs["act_dim"], generator=generator)
     with torch.no_grad():
+        actions = model.act(obs, noise)
         log_prob = model.log_prob(obs, actions)
     advantages, returns = torch.randn(2, rows, generator=generator)
     return [obs, actions, log_prob, advantages, returns]
@@ -217,9 +219,9 @@ def test_actions_have_the_mean_and_the_std():
     with pytest.raises(ValueError, match="3 entries"):
         ActorCritic(2, 2, init_std=(0.5, 2.0, 1.0))
     model = ActorCritic(2, 2, init_std=0.5)
-    noise = model.act(torch.ones(40_000, 2)) - torch.from_numpy(model.mean_action(np.ones(2)))
-    assert noise.mean(0).tolist() == pytest.approx([0, 0], abs=0.02)
-    assert noise.std(0).tolist() == pytest.approx([0.5, 0.5], abs=0.02)
+    noise = torch.tensor([[1.0, -2.0]])
+    moved = model.act(torch.ones(1, 2), noise) - torch.from_numpy(model.mean_action(np.ones(2)))
+    assert moved.tolist()[0] == pytest.approx([0.5, -1.0], abs=1e-6)
 
 
 def test_mirror_is_exact_but_for_the_preferred_side():
@@ -350,7 +352,8 @@ def test_pendulum_swings_up():
     config = PPOConfig(
         total_timesteps=80_000, num_envs=8, num_steps=256, gamma=0.95, update_epochs=10,
         num_minibatches=16, learning_rate=1e-3, max_learning_rate=3e-3, critic_learning_rate=3e-3,
-        target_kl=0.02, init_std=0.6, encoder_hidden=(64,), trunk_hidden=(64,),
+        target_kl=0.02, init_std=0.6, noise_correlation=0.5,
+        encoder_hidden=(64,), trunk_hidden=(64,),
     )
     model = learn(make, config, episode_keys=())
     returns, env = [], make(0)
@@ -386,6 +389,20 @@ def test_the_noise_never_exceeds_its_bound():
     learn(lambda index: Square(1.0), PPOConfig(total_timesteps=600, max_std=0.2, **SMALL),
           on_update=lambda model, row: stds.append(row["std"]))
     assert len(stds) >= 2 and max(stds) <= 0.2 + 1e-6
+
+
+def test_the_noise_lasts_from_step_to_step():
+    taken = []
+    env = partial(Probe, lambda obs, action, t: taken.append(action) or 0.0, length=10_000)
+    config = PPOConfig(total_timesteps=2000, **SMALL | {"num_envs": 1, "num_steps": 2000},
+                       init_std=0.3, noise_correlation=(0.9,), num_minibatches=1)
+    learn(lambda index: env(), config, episode_keys=())
+    noise = np.array(taken)
+    assert noise.std() == pytest.approx(0.3, abs=0.06)  # as large as without
+    for lag in (1, 5):
+        assert np.corrcoef(noise[lag:], noise[:-lag])[0, 1] == pytest.approx(0.9**lag, abs=0.1)
+    with pytest.raises(ValueError, match="noise_correlation has 2 entries"):
+        learn(lambda index: env(), PPOConfig(noise_correlation=(0.9, 0.0), **SMALL))
 
 
 def test_init_starts_from_a_trained_policy():
@@ -442,6 +459,7 @@ def test_rewards_that_are_no_numbers_stop_the_training(reward):
     ("num_minibatches", 1921, "at most 1920"), ("checkpoint_every", 0, "at least 1"),
     ("gamma", 1.01, "[0, 1]"), ("gamma", math.nan, "[0, 1]"), ("gae_lambda", -0.1, "[0, 1]"),
     ("clip_coef", 0, "above 0"), ("max_grad_norm", math.inf, "finite"), ("init_std", -1, "above 0"),
+    ("noise_correlation", 1.5, "in [0, 1]"), ("noise_correlation", (0.5, -1), "in [0, 1]"),
     ("max_std", math.nan, "above 0"), ("init_std", (0.1, 0.0), "above 0"),
     ("init_std", (), "above 0"),
     ("learning_rate", 1.0, "[0.0001, 0.001]"), ("learning_rate", 1e-5, "[0.0001, 0.001]"),
@@ -522,6 +540,16 @@ def test_resuming_needs_a_checkpoint_and_an_env_that_fits(tmp_path):
         learn(lambda index: Probe(), config, run_dir=tmp_path, resume=True)
     with pytest.raises(ValueError, match="obs_dim = 2, but the env has 6"):
         learn(lambda index: Square(), PPOConfig(**SMALL), run_dir=tmp_path, resume=True)
+
+
+@pytest.mark.parametrize(("wrong", "named"), [
+    ({"resume": True}, "resume = True"), ({"init": "policy.pt"}, "'policy.pt'"),
+    ({"episode_keys": "t_cr"}, "'t_cr'"), ({"groups": "flat"}, "'flat'"),
+    ({"mirror": ([1, 2], [1, 1], [0], [1])}, r"\[1, 2\]"),
+])
+def test_bad_arguments_of_learn_are_named(wrong, named):
+    with pytest.raises(ValueError, match=named):
+        learn(lambda index: Probe(), PPOConfig(**SMALL), **wrong)
 
 
 def test_ctrl_c_finishes_the_update_and_keeps_it(tmp_path):
