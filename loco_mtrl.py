@@ -205,9 +205,8 @@ class LocoEnv(gymnasium.Env):
 
     ## Reward
     (d_{t-1} - d_t) / dt, the velocity toward the goal, m/s. The paper prints the opposite sign but
-    calls it the velocity toward the target. d is straight, or in part the length of the shortest
-    way around what is too high to climb, which has no dead ends: (1 - way) straight + way shortest.
-    A fall costs 2 m / dt, which is ours; with paper=True nothing, as in the paper.
+    calls it the velocity toward the target. A fall costs 2 m / dt, which is ours; with paper=True
+    nothing, as in the paper.
 
     ## Episode
     It terminates at the goal (base within 0.5 m) and in a fall (base tipped by over 60 degrees or
@@ -223,7 +222,6 @@ class LocoEnv(gymnasium.Env):
         difficulty: in [0, 1], or (low, high) to draw it from, once for each terrain.
         tg, lidar: the paper's ablations (section 3) leave one of them out.
         paper: the paper's own state and reward: no memory, no tilt, no cost of a fall.
-        way: share of the shortest way in the reward, in [0, 1]; 0: the paper's reward.
         terrains: how many terrains of each task to build; Bullet never frees a mesh, so the pool
             is built once and episodes draw from it. A finished Terrain counts once.
         pool_seed: seeds the pool; `reset(seed=...)` seeds all else.
@@ -237,17 +235,15 @@ class LocoEnv(gymnasium.Env):
     metadata = {"render_modes": ["rgb_array"], "render_fps": round(1 / DT)}
 
     def __init__(self, tasks=None, difficulty=(0.0, 1.0), tg=True, lidar=True, paper=False,
-                 way=0.0, terrains=1, pool_seed=0, render_mode=None, gui=False):
+                 terrains=1, pool_seed=0, render_mode=None, gui=False):
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
         low, high = difficulty if np.size(difficulty) == 2 else (difficulty, difficulty)
         if not all(isinstance(d, Real) for d in (low, high)) or not 0 <= low <= high <= 1:
             raise ValueError(f"difficulty must be in [0, 1] or (low, high), got {difficulty}")
-        if not isinstance(way, Real) or not 0 <= way <= 1:
-            raise ValueError(f"way must be in [0, 1], got {way!r}")
         if not isinstance(terrains, int) or terrains < 1:
             raise ValueError(f"terrains must be a whole number of at least 1, got {terrains!r}")
-        self.render_mode, self.show_lidar, self.way = render_mode, False, way
+        self.render_mode, self.show_lidar = render_mode, False
         tasks = list(PILLAR_TASKS) if tasks is None else tasks
         tasks = tasks if isinstance(tasks, (list, tuple)) else [tasks]
         if not tasks:
@@ -394,7 +390,7 @@ class LocoEnv(gymnasium.Env):
             p.resetBasePositionAndOrientation(body, (0, 0, -1000), (0, 0, 0, 1))
         self._move_people()
         observation = self._observe()
-        self.start_distance, self.to_go = self.distance, self._to_go()
+        self.start_distance = self.distance
         if self.visual:
             p.resetBasePositionAndOrientation(self.flag, self.goal, (0, 0, 0, 1))
             dx, dy, _ = np.subtract(self.goal, self.position)
@@ -425,7 +421,7 @@ class LocoEnv(gymnasium.Env):
             self._move_people()
 
         self.steps += 1
-        distance, to_go = self.distance, self.to_go
+        distance = self.distance
         observation = self._observe(self.steps % LIDAR_EVERY == 0)
         if not math.hypot(self.distance, *self.rates) < EXPLODED:  # not: NaN compares to nothing
             p.removeBody(self.robot)
@@ -434,18 +430,9 @@ class LocoEnv(gymnasium.Env):
             return np.zeros_like(observation), 0.0, True, False, self._info(False, True)
         success = self.distance < GOAL_RADIUS
         fall = self.up < FALL_UP or self.velocity[2] < -FALL_SPEED
-        self.to_go = self._to_go()
         cost = FALL_COST if fall and not success and not self.paper else 0.0
-        reward = (to_go - self.to_go - cost) / DT
+        reward = (distance - self.distance - cost) / DT
         return observation, reward, success or fall, False, self._info(success, fall)
-
-    def _to_go(self):
-        """The distance that the reward counts, m."""
-        if self.way == 0:
-            return self.distance
-        x, y, _ = self.position
-        to_go = self.terrain.to_go(self.route, x - self.origin[0], y)
-        return (1 - self.way) * self.distance + self.way * to_go
 
     def _info(self, success, fall):
         progress = 1.0 if success else 1.0 - self.distance / self.start_distance
@@ -583,7 +570,7 @@ def train(args):
             load_checkpoint(run_dir / "checkpoint.pt")  # a bad one is better named by one process
         return launch(args)
     options = {"tg": args.tg, "lidar": args.lidar, "paper": args.paper}
-    meta = {**options, "way": args.way, "tasks": args.tasks, "sequential": args.sequential,
+    meta = {**options, "tasks": args.tasks, "sequential": args.sequential,
             "seed": args.seed, "command": "python loco_mtrl.py " + " ".join(args.argv),
             "commit": _commit()}
     # Tasks, share of all steps done at the end, steps of a rollout, gamma, largest std of noise.
@@ -612,8 +599,7 @@ def train(args):
                 init_std=init_std, noise_correlation=noise_correlation,
                 gamma=gamma, learning_rate=5e-4, target_kl=0.05, max_std=max_std,
             )
-            make_env = functools.partial(training_env, seed=args.seed, tasks=tasks, way=args.way,
-                                         **options)
+            make_env = functools.partial(training_env, seed=args.seed, tasks=tasks, **options)
             learn(make_env, config, run_dir=run_dir, resume=resume, mirror=mirror, meta=meta,
                   episode_keys=("t_cr", "success", "fall", "exploded"), groups=args.tasks,
                   on_update=on_update)
@@ -953,16 +939,6 @@ def _whole(least):
     return parse
 
 
-def _share(text):
-    try:
-        value = float(text)
-    except ValueError:
-        value = -1.0
-    if not 0 <= value <= 1:
-        raise argparse.ArgumentTypeError(f"must be in [0, 1], got {text!r}")
-    return value
-
-
 def mesh_options(p):
     p.add_argument("--mesh", metavar="FILE.obj", help="a scanned building instead")
     p.add_argument("--scale", type=float, default=1.0, help="of the mesh, metres a unit")
@@ -984,8 +960,6 @@ def parse(argv):
     p.add_argument("--paper", action="store_true",
                    help="the paper's own state and reward: the robot knows neither its tilt nor "
                    "where it was, and a fall costs nothing")
-    p.add_argument("--way", type=_share, default=0.0, help="share of the shortest way around walls "
-                   "in the reward; 0, the default: straight to the goal, as in the paper")
     p.add_argument("--sequential", action="store_true", help="one task after the other, not mixed")
     p.add_argument("--seed", type=_whole(0), default=0)
     p.add_argument("--run-dir", default="runs/main", help="(default %(default)s)")

@@ -227,24 +227,6 @@ def test_reward_is_velocity_toward_the_goal_and_sums_to_the_progress():
     env.close()
 
 
-def test_the_shortest_way_around_a_wall_is_in_the_reward():
-    """The way to an opening and on, by hand; 8-connected ways are up to 8 % longer."""
-    env = LocoEnv(wall_ahead, way=0.75)
-    env.reset(seed=0, options={"route": 0})
-    place_, goal = env.terrain, env.terrain.goals[0]
-    x, y, *_ = place_.starts[0]
-    assert (x < 6) != (goal[0] < 6)  # the wall is between them, its opening at y > 2.4
-    around = np.hypot(x - 6.2, y - 2.8) + np.hypot(goal[0] - 6.2, goal[1] - 2.8)
-    assert around * 0.97 - 0.3 < place_.to_go(0, x, y) < around * 1.09 + 0.4
-    assert place_.to_go(0, *goal[:2]) < 0.15
-    where = lambda: np.subtract(env.position, env.origin)[:2]  # noqa: E731
-    counts = lambda: 0.25 * env.distance + 0.75 * place_.to_go(0, *where())  # noqa: E731
-    before = counts()
-    total = sum(env.step(np.zeros(17))[1] * DT for _ in range(60))
-    assert total == pytest.approx(before - counts(), abs=1e-6)
-    env.close()
-
-
 def test_zero_action_walks_by_itself(plane):
     """At least 0.3 m/s for 8 s on flat ground, from any phase of the stride."""
     for seed in range(6):
@@ -433,9 +415,6 @@ def test_mirror_is_what_a_mirrored_robot_would_observe(flat):
         ({"difficulty": (0.5, 0.2)}, "0.5"),
         ({"difficulty": float("nan")}, "nan"),
         ({"difficulty": "hard"}, "hard"),
-        ({"way": -0.1}, "-0.1"),
-        ({"way": np.nan}, "nan"),
-        ({"way": "short"}, "short"),
         ({"terrains": 0}, "0"),
         ({"terrains": 1.5}, "1.5"),
         ({"render_mode": "ascii"}, "ascii"),
