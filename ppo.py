@@ -223,9 +223,14 @@ class ActorCritic(nn.Module):
         return torch.stack((torch.cat((obs, side), -1), torch.cat((image, -side), -1)))
 
     def mean(self, obs):
-        """Mean of the policy: (..., obs) -> (..., act)."""
+        """Mean of the policy, in (-1, 1): (..., obs) -> (..., act).
+
+        Bounded, for where actions are clipped, noise changes nothing and nothing is learned: a mean
+        that has once grown beyond the bounds would stay there.
+        """
         out = self.actor(self.views(obs))
-        return (out[0] + flip(out[1], *self.flip_act)) / 2 if self.flip_act else out[0]
+        out = (out[0] + flip(out[1], *self.flip_act)) / 2 if self.flip_act else out[0]
+        return out.tanh()
 
     def log_std(self):
         """Logarithm of the exploration noise's standard deviation: (act,)."""

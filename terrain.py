@@ -290,7 +290,10 @@ def _taper(reach):
 
 
 def _wall(difficulty):
-    """Wall height, m: past a fifth of the difficulty nobody looks over it or climbs it."""
+    """Height of a wall, or depth of a drop, m: past a fifth of the difficulty it stops everybody.
+
+    If it grew with difficulty all the way, half of the drops would be steps to run down.
+    """
     return min(1.2, 4 * difficulty)
 
 
@@ -416,14 +419,14 @@ def hurdles(rng, difficulty):
 
 
 def ridges(rng, difficulty):
-    """Two winding paths, 2 m down to 0.8 m wide, over a drop of up to 1 m."""
+    """Two winding paths, 2 m down to 0.8 m wide, over a drop."""
     path = (U == 0) | (U == SPAN)
     for _ in range(2):
         turn, phase, swing = rng.uniform(0.5, 1.2), rng.uniform(0, 6.3), rng.uniform(0.3, 1.5)
         middle = rng.uniform(-2, 2) + swing * np.sin(turn * X + phase)
         across = (2.0 - 1.2 * difficulty) * np.hypot(1, swing * turn * np.cos(turn * X + phase))
         path |= np.abs(Y - middle) <= across / 2
-    return np.where(path, 0.0, -1.0 * difficulty)
+    return np.where(path, 0.0, -_wall(difficulty))
 
 
 def corridors(rng, difficulty):
@@ -528,15 +531,16 @@ def traps(rng, difficulty):
 
 
 def pits(rng, difficulty):
-    """Up to 14 pits of 0.6-2.4 m a side and up to 1 m deep, to walk around."""
-    return -_boxes(rng, 14 * difficulty, (3, 12), (0.5 * difficulty, difficulty))
+    """Up to 14 pits of 0.6-2.4 m a side, to walk around."""
+    deep = _wall(difficulty)
+    return -_boxes(rng, 14 * difficulty, (3, 12), (0.5 * deep, deep))
 
 
 def coasts(rng, difficulty):
-    """A winding edge along the way, a drop of up to 1 m on one side of it."""
-    turn, phase, swing = rng.uniform(0.5, 1), rng.uniform(0, 6.3), rng.uniform(0.8, 2)
+    """A winding edge along the way, the more so the harder, a drop on one side of it."""
+    turn, phase, swing = rng.uniform(0.5, 1), rng.uniform(0, 6.3), 2 * difficulty
     edge, side = rng.uniform(-1, 1) + swing * np.sin(turn * X + phase), rng.choice([-1, 1])
-    return np.where((side * Y > edge) & (U > 0) & (U < SPAN), -1.0 * difficulty, 0.0)
+    return np.where((side * Y > edge) & (U > 0) & (U < SPAN), -_wall(difficulty), 0.0)
 
 
 def crags(rng, difficulty):

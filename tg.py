@@ -88,8 +88,8 @@ def _leg_angles(leg, x, y, z):
 # rough ground, with exploration noise, it falls less than half as often as legs of 0.32 m do.
 PARAMETERS = {
     "frequency": (3.0, 1.0),  # Hz, strides a second
-    "left_stride": (0.15, 0.35),  # m, travel of the left feet during stance; negative walks back
-    "right_stride": (0.15, 0.35),  # m; unlike the left one, it turns the robot, on the spot, too
+    "left_stride": (0.13, 0.27),  # m, travel of the left feet during stance; negative walks back
+    "right_stride": (0.13, 0.27),  # m; unlike the left one, it turns the robot, on the spot, too
     "swing_height": (0.26, 0.10),  # m, lift of the feet in mid-swing; soft legs reach 0.14-0.18 m
     "stance_height": (0.25, 0.07),  # m, hips above the feet
 }

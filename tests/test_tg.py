@@ -101,14 +101,14 @@ def test_stance_slides_back_and_swing_lifts():
     generator = tg.TrajectoryGenerator()
     generator.reset(0.0)  # FR and RL touch down, the others take off
     feet = generator.feet()
-    np.testing.assert_allclose(feet[:, 0], [0.075, -0.075, -0.075, 0.075])  # half of 0.15 m
+    np.testing.assert_allclose(feet[:, 0], [0.065, -0.065, -0.065, 0.065])  # half of 0.13 m
     np.testing.assert_allclose(feet[:, 2], -0.25)
     generator.reset(2 * np.pi * 0.75)  # FR is half through its swing, FL half through its stance
     feet = generator.feet()
     assert feet[0] == pytest.approx([0.0, tg.LATERAL[0] - 0.12, -0.25 + 0.26])
     assert feet[1] == pytest.approx([0.0, tg.LATERAL[1] + 0.12, -0.25])
     generator.reset(2 * np.pi * 0.1)  # a fifth of the stance of FR is over
-    assert generator.feet()[0, 0] == pytest.approx(0.075 - 0.15 / 5)
+    assert generator.feet()[0, 0] == pytest.approx(0.065 - 0.13 / 5)
 
 
 @settings(max_examples=50, deadline=None)
@@ -121,8 +121,8 @@ def test_feet_move_without_jumps(action, phase):
     for _ in range(1000):
         generator.step(action, 1e-3)
         path.append(generator.feet())
-    # 0.50 m of stride in a swing of 0.5 / 4 s at most, 0.36 m of lift along half a sine
-    fastest = max(0.50 / 0.125, np.pi * 0.36 / 0.125)
+    # 0.40 m of stride in a swing of 0.5 / 4 s at most, 0.36 m of lift along half a sine
+    fastest = max(0.40 / 0.125, np.pi * 0.36 / 0.125)
     assert np.abs(np.diff(path, axis=0)).max() < 1e-3 * fastest + 1e-9
 
 
