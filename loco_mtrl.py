@@ -595,7 +595,8 @@ def train(args):
     restarted = os.environ.get("TORCHELASTIC_RESTART_COUNT", "0") != "0"  # torchrun, after a crash
     resume, on_update = args.resume or restarted, tensorboard(run_dir) if args.tensorboard else None
     try:
-        for tasks, share, num_steps, gamma, target_kl, max_std in stages:  # each resumes the one before
+        # Each stage resumes the one before.
+        for tasks, share, num_steps, gamma, target_kl, max_std in stages:
             config = PPOConfig(
                 total_timesteps=round(share * args.steps), num_envs=10, num_steps=num_steps,
                 num_minibatches=min(num_steps // 50, 16), update_epochs=2, seed=args.seed,
