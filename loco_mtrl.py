@@ -279,7 +279,7 @@ class LocoEnv(gymnasium.Env):
         for name in HOT:  # BulletClient looks a function up anew for each call, which costs 3 us
             setattr(p, name, getattr(p, name))
         p.setPhysicsEngineParameter(fixedTimeStep=DT, numSubSteps=SUBSTEPS, numSolverIterations=20,
-                                    enableConeFriction=0)
+                                    enableConeFriction=0, deterministicOverlappingPairs=1)
         # Side by side, farther apart than the LiDAR reaches: a reset only moves the robot.
         self.offsets, edge = [], 0.0
         for terrain in self.pool:
@@ -546,7 +546,7 @@ if "LocoMTRL-v0" not in gymnasium.registry:  # run as a script, this file is imp
 
 # ------------------------------------------------------------------------------- train
 
-REWARD_SCALE = 0.1  # keeps the critic's targets near 1; the environment's own reward is the paper's
+REWARD_SCALE = 0.1  # keeps the critic's targets near 1
 MAIN_STEPS = 3_300_000  # of the no-argument run
 # Short rollouts learn fastest at first; later the noise of so few samples holds the policy back.
 # And a policy is judged without the exploration noise, which has freed it wherever it was stuck: so

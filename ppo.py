@@ -481,7 +481,8 @@ def learn(make_env, config, *, run_dir=None, resume=False, mirror=None, init=Non
 
     Args:
         make_env: function of the environment's number, rank * num_envs + i, to a Gymnasium env
-            with Box observations and actions. What the env gets is clipped to its action space.
+            with Box observations and actions. What the env gets is clipped to its action space, and
+            the policy's mean lies in (-1, 1): other bounds need gymnasium.wrappers.RescaleAction.
         run_dir: folder for config.json, progress.csv, curve.png, checkpoint.pt; None: no files.
         resume: go on from run_dir's checkpoint, with its network and its mirror.
         mirror: see ActorCritic.
