@@ -553,8 +553,8 @@ MAIN_STEPS = 3_300_000  # of the no-argument run
 # the last part of the training has little of it.
 SHORT_UNTIL = 400_000  # steps
 QUIET_FROM, QUIET_STD = 0.7, 0.2  # share of all steps, largest standard deviation from there on
-# The gait carries over these soon, and they would take most of the updates from those that need
-# eyes: they rest between the first and the last part.
+# The gait decides these (all but stones are soon done), and the noise of their samples drowns what
+# the others teach, which need eyes: they rest between the first and the last part.
 BLIND_TASKS = ("rugged", "holes", "stones", "pyramids_up", "pyramids_down", "gaps", "hurdles",
                "blocks", "waves")
 

@@ -535,7 +535,7 @@ def learn(make_env, config, *, run_dir=None, resume=False, mirror=None, init=Non
         return build_policy(checkpoint)  # nothing left to learn
 
     num_steps, num_envs = config.num_steps, config.num_envs
-    kept = torch.tensor(config.noise_correlation)  # share of the noise
+    kept = torch.tensor(config.noise_correlation)  # share of the noise that lives on
     first = rank * num_envs
     envs = gym.vector.SyncVectorEnv([partial(make_env, first + i) for i in range(num_envs)])
     obs_space, act_space = envs.single_observation_space, envs.single_action_space

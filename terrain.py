@@ -289,10 +289,10 @@ def _taper(reach):
     return np.clip(np.minimum(U, SPAN - U) / reach, 0, 1)
 
 
-def _wall(difficulty):
+def _barrier(difficulty):
     """Height of a wall, or depth of a drop, m: past a fifth of the difficulty it stops everybody.
 
-    If it grew with difficulty all the way, half of the drops would be steps to run down.
+    If it grew with difficulty all the way, a third of the drops would be steps to run down.
     """
     return min(1.2, 4 * difficulty)
 
@@ -426,7 +426,7 @@ def ridges(rng, difficulty):
         middle = rng.uniform(-2, 2) + swing * np.sin(turn * X + phase)
         across = (2.0 - 1.2 * difficulty) * np.hypot(1, swing * turn * np.cos(turn * X + phase))
         path |= np.abs(Y - middle) <= across / 2
-    return np.where(path, 0.0, -_wall(difficulty))
+    return np.where(path, 0.0, -_barrier(difficulty))
 
 
 def corridors(rng, difficulty):
@@ -441,7 +441,7 @@ def corridors(rng, difficulty):
             open_ |= (np.abs(Y - ys[k]) <= half) & (X >= x0 - half) & (X <= x1 + half)
             y0, y1 = np.sort(ys[k : k + 2][[0, -1]])
             open_ |= (np.abs(X - x1) <= half) & (Y >= y0 - half) & (Y <= y1 + half)
-    return np.where(open_, 0.0, _wall(difficulty))
+    return np.where(open_, 0.0, _barrier(difficulty))
 
 
 def walls(rng, difficulty):
@@ -449,7 +449,7 @@ def walls(rng, difficulty):
     h = np.zeros(SHAPE)
     for row in np.linspace(PAD + 3, SHAPE[0] - PAD - 4, 1 + round(4 * difficulty)).astype(int):
         gap = (Y[0] + rng.uniform(0, 4)) % (2.6 + 1.4 * difficulty) < 2.0 - difficulty
-        h[row] = np.where(gap, 0.0, _wall(difficulty))
+        h[row] = np.where(gap, 0.0, _barrier(difficulty))
     return h
 
 
@@ -486,7 +486,7 @@ def _rooms(rng, x, y, difficulty, door):
         wide = min(rng.integers(door[0], door[1] + 1), len(wall))
         at = rng.integers(len(wall) - wide + 1)
         wall[at : at + wide] = 0
-    return h * _wall(difficulty)
+    return h * _barrier(difficulty)
 
 
 def _lines(rng, low, high, size):
@@ -515,7 +515,7 @@ def screens(rng, difficulty):
     for _ in range(round(20 * difficulty)):
         i, j, long = rng.integers(PAD, SHAPE[0] - PAD), rng.integers(SHAPE[1]), rng.integers(4, 16)
         wall = np.s_[i, j : j + long] if rng.random() < 0.6 else np.s_[i : i + long, j]
-        h[wall] = _wall(difficulty)
+        h[wall] = _barrier(difficulty)
     return h
 
 
@@ -526,13 +526,13 @@ def traps(rng, difficulty):
         i, j = rng.integers(PAD + 1, SHAPE[0] - PAD - 1), rng.integers(1, SHAPE[1] - 8)
         wide, deep = rng.integers(7, 16), rng.choice([-1, 1]) * rng.integers(3, 9)
         a, b = sorted((i, int(np.clip(i + deep, PAD, SHAPE[0] - PAD))))
-        h[i, j : j + wide] = h[a : b + 1, [j, min(j + wide, SHAPE[1]) - 1]] = _wall(difficulty)
+        h[i, j : j + wide] = h[a : b + 1, [j, min(j + wide, SHAPE[1]) - 1]] = _barrier(difficulty)
     return h
 
 
 def pits(rng, difficulty):
     """Up to 14 pits of 0.6-2.4 m a side, to walk around."""
-    deep = _wall(difficulty)
+    deep = _barrier(difficulty)
     return -_boxes(rng, 14 * difficulty, (3, 12), (0.5 * deep, deep))
 
 
@@ -540,7 +540,7 @@ def coasts(rng, difficulty):
     """A winding edge along the way, the more so the harder, a drop on one side of it."""
     turn, phase, swing = rng.uniform(0.5, 1), rng.uniform(0, 6.3), 2 * difficulty
     edge, side = rng.uniform(-1, 1) + swing * np.sin(turn * X + phase), rng.choice([-1, 1])
-    return np.where((side * Y > edge) & (U > 0) & (U < SPAN), -_wall(difficulty), 0.0)
+    return np.where((side * Y > edge) & (U > 0) & (U < SPAN), -_barrier(difficulty), 0.0)
 
 
 def crags(rng, difficulty):
@@ -603,7 +603,7 @@ def make_terrain(task, rng, difficulty):
         for strip in (heights[:pad], heights[-pad:]):
             strip[:] = np.median(strip)
         if getattr(generate, "fence", False):
-            heights[[0, -1]], heights[:, [0, -1]] = _wall(difficulty), _wall(difficulty)
+            heights[[0, -1]], heights[:, [0, -1]] = _barrier(difficulty), _barrier(difficulty)
         ground = Ground(heights, (cell, cell))
         length = ground.size[0]
         # From either end, in turn with wherever else a robot can stand: in a maze, on a ridge.

@@ -224,6 +224,12 @@ def test_actions_have_the_mean_and_the_std():
     assert moved.tolist()[0] == pytest.approx([0.5, -1.0], abs=1e-6)
 
 
+def test_the_mean_stays_where_noise_is_felt():
+    model = ActorCritic(2, 2)
+    torch.nn.init.constant_(model.actor.head.bias, 1.5)
+    assert model.mean_action(np.ones(2)).tolist() == pytest.approx([math.tanh(1.5)] * 2, abs=0.05)
+
+
 def test_mirror_is_exact_but_for_the_preferred_side():
     torch.manual_seed(0)
     plain, model = ActorCritic(4, 3, (1, 2)), ActorCritic(4, 3, (1, 2), mirror=MIRROR)

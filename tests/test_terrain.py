@@ -179,6 +179,13 @@ def test_tasks_can_be_stood_on_and_walked(task, difficulty):
     assert oracle(place.height, terrain.STEP, place.starts[0], place.goals[0])
 
 
+@pytest.mark.parametrize("task", ["ridges", "coasts"])
+def test_drops_are_deep_long_before_the_way_is_hard(task):
+    for difficulty, depth in ((0.1, 0.4), (0.3, 1.2), (1.0, 1.2)):
+        heights = PILLAR_TASKS[task](np.random.default_rng(0), difficulty)
+        assert heights.min() == pytest.approx(-depth)
+
+
 @pytest.mark.parametrize("task", PILLAR_TASKS)
 def test_difficulty_zero_is_flat_and_one_is_not(task):
     assert np.ptp(PILLAR_TASKS[task](np.random.default_rng(0), 0.0)) < 0.01
