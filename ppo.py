@@ -207,20 +207,29 @@ class ActorCritic(nn.Module):
         self.register_buffer("obs_sum_sq", torch.zeros(obs_dim, dtype=torch.float64))
 
     def views(self, obs):
-        """What the networks see: normalised observations, (..., obs) -> (1, ..., obs).
+        """What the networks see: normalised observations, (..., obs) -> (..., 1, obs) float32.
 
-        Or (2, ..., obs + 1) with the mirror image, and the side in the last column.
+        Or (..., 2, obs + 1) with the mirror image, and the side in the last column.
         """
+        obs = obs.float()
         if self.count > 0:
-            std = (self.obs_sum_sq / self.count).sqrt()
-            obs = (obs - self.obs_mean) / (std + 1e-6)  # an entry may be constant
+            std = (self.obs_sum_sq / self.count).sqrt() + 1e-6  # an entry may be constant
+            obs = (obs - self.obs_mean.float()) / std.float()
         # Clipped: one absurd sensor value must not throw the network out of all it has seen.
-        obs = obs.clamp(-10, 10).float()
+        obs = obs.clamp(-10, 10)
         if not self.flip_obs:
-            return obs[None]
+            return obs.unsqueeze(-2)
         side = torch.ones_like(obs[..., :1])
         image = flip(obs, *self.flip_obs)
-        return torch.stack((torch.cat((obs, side), -1), torch.cat((image, -side), -1)))
+        return torch.stack((torch.cat((obs, side), -1), torch.cat((image, -side), -1)), -2)
+
+    def _mean(self, views):
+        out = self.actor(views).unbind(-2)
+        out = (out[0] + flip(out[1], *self.flip_act)) / 2 if self.flip_act else out[0]
+        return out.tanh()
+
+    def _value(self, views):
+        return self.critic(views).mean((-2, -1))
 
     def mean(self, obs):
         """Mean of the policy, in (-1, 1): (..., obs) -> (..., act).
@@ -228,9 +237,7 @@ class ActorCritic(nn.Module):
         Bounded, for where actions are clipped, noise changes nothing and nothing is learned: a mean
         that has once grown beyond the bounds would stay there.
         """
-        out = self.actor(self.views(obs))
-        out = (out[0] + flip(out[1], *self.flip_act)) / 2 if self.flip_act else out[0]
-        return out.tanh()
+        return self._mean(self.views(obs))
 
     def log_std(self):
         """Logarithm of the exploration noise's standard deviation: (act,)."""
@@ -244,18 +251,27 @@ class ActorCritic(nn.Module):
 
     def value(self, obs):
         """Expected discounted return: (..., obs) -> (...)."""
-        return self.critic(self.views(obs)).mean(0).squeeze(-1)
+        return self._value(self.views(obs))
 
-    def log_prob(self, obs, actions):
-        """Log-density of `actions` (..., act) in the states `obs` (..., obs): (...)."""
-        log_std = self.log_std()
-        z = (actions - self.mean(obs)) / log_std.exp()
-        return (-0.5 * z**2 - log_std - 0.5 * math.log(2 * math.pi)).sum(-1)
+    def _log_density(self, noise):
+        """Log-density of the action that `noise` standard deviations off the mean are: (...)."""
+        return (-0.5 * noise**2 - self.log_std() - 0.5 * math.log(2 * math.pi)).sum(-1)
+
+    def evaluate(self, views, actions):
+        """Log-density of `actions` (..., act) and values, (...) each, where `views(obs)` was seen.
+
+        Views instead of observations: a rollout's are made once and serve all its minibatches.
+        """
+        noise = (actions - self._mean(views)) / self.log_std().exp()
+        return self._log_density(noise), self._value(views)
 
     @torch.no_grad()
     def act(self, obs, noise):
-        """Actions for `noise`, standard normal: (..., obs), (..., act) -> (..., act); unclipped."""
-        return self.mean(obs) + self.log_std().exp() * noise
+        """Actions, unclipped, and their log-density for `noise`, standard normal.
+
+        (..., obs), (..., act) -> (..., act), (...).
+        """
+        return self.mean(obs) + self.log_std().exp() * noise, self._log_density(noise)
 
     @torch.no_grad()
     def mean_action(self, obs):
@@ -332,13 +348,13 @@ def ppo_update(model, optimiser, batch, config, generator):
     """Several epochs of clipped gradient steps on one rollout, on all ranks together.
 
     Args:
-        batch: obs (B, obs), actions (B, act), old log-probabilities, advantages and returns (B,).
-            B may differ from rank to rank, since each has its own number of reset rows.
+        batch: model.views of observations (B, ...), actions (B, act), old log-probabilities,
+            advantages and returns (B,). B may differ from rank to rank, since each has its own number of reset rows.
         optimiser: with two parameter groups, the actor's (whose step size it adapts), the critic's.
 
     Returns a dict of plain numbers, the same on every rank: columns of progress.csv.
     """
-    obs, actions, old_log_prob, advantages, returns = batch
+    views, actions, old_log_prob, advantages, returns = batch
     a, r = advantages.double(), returns.double()
     moments = sum_over_ranks(torch.stack((torch.ones_like(a), a, a**2, r, r**2)).sum(1))
     a_mean, a_square, r_mean, r_square = (moments[1:] / moments[0]).tolist()
@@ -357,10 +373,10 @@ def ppo_update(model, optimiser, batch, config, generator):
     for _epoch in range(config.update_epochs):
         pieces = torch.zeros(4)
         # tensor_split, not split: the same number of minibatches on every rank, or they deadlock.
-        shuffled = torch.randperm(len(obs), generator=generator)
+        shuffled = torch.randperm(len(views), generator=generator)
         for rows in shuffled.tensor_split(config.num_minibatches):
             flat.zero_()
-            log_prob, values = model.log_prob(obs[rows], actions[rows]), model.value(obs[rows])
+            log_prob, values = model.evaluate(views[rows], actions[rows])
             loss = ppo_loss(log_prob, old_log_prob[rows], advantages[rows], values, returns[rows],
                             config.clip_coef).sum(1)
             (loss[0] + loss[1]).backward()
@@ -573,7 +589,7 @@ def learn(make_env, config, *, run_dir=None, resume=False, mirror=None, init=Non
 
     obs = torch.zeros(num_steps + 1, num_envs, dims["obs_dim"])
     actions = torch.zeros(num_steps, num_envs, dims["act_dim"])
-    rewards = torch.zeros(num_steps, num_envs)
+    rewards, log_prob = torch.zeros(2, num_steps, num_envs)
     terminated, done, prev_done = torch.zeros(3, num_steps, num_envs, dtype=torch.bool)
     generator = torch.Generator()
     episodes = deque(maxlen=100)
@@ -606,7 +622,7 @@ def learn(make_env, config, *, run_dir=None, resume=False, mirror=None, init=Non
                 # Each action by itself is still drawn from the policy, so the loss stays the same.
                 fresh_noise = torch.randn(noise.shape, generator=generator)
                 noise = kept * noise + (1 - kept**2).sqrt() * fresh_noise
-                actions[t] = model.act(obs[t], noise)
+                actions[t], log_prob[t] = model.act(obs[t], noise)
                 command = actions[t].numpy().reshape(envs.action_space.shape)
                 command = command.clip(act_space.low, act_space.high).astype(act_space.dtype)
                 next_obs, reward, terminal, truncated, info = envs.step(command)
@@ -624,20 +640,21 @@ def learn(make_env, config, *, run_dir=None, resume=False, mirror=None, init=Non
             collect_s = time.perf_counter() - start
 
             with torch.no_grad():  # with the parameters and the normaliser that have acted
-                values, log_prob = model.value(obs), model.log_prob(obs[:-1], actions)
+                values, seen = model.value(obs), obs[:-1][~prev_done]
+                views = model.views(seen)
             advantages, returns = compute_gae(rewards, values, terminated, done, prev_done,
                                               config.gamma, config.gae_lambda)
-            batch = [x[~prev_done] for x in (obs[:-1], actions, log_prob, advantages, returns)]
-            stats = ppo_update(model, optimiser, batch, config, generator)
+            batch = [x[~prev_done] for x in (actions, log_prob, advantages, returns)]
+            stats = ppo_update(model, optimiser, [views, *batch], config, generator)
             model.limit_std(config.max_std)
             # Only now: while learning, the old and the new policy must see the same scale.
-            model.update_normaliser(batch[0])
+            model.update_normaliser(seen)
             if not all(tensor.isfinite().all() for tensor in model.state_dict().values()):
                 raise FloatingPointError(f"update {update + 1} made parameters infinite or NaN: "
                                          "are all rewards and observations of the env numbers?")
 
             known = [[e[name] for e in episodes if name in e] for name in means]
-            sums = [*map(sum, known), *map(len, known), len(batch[0]), len(interrupts)]
+            sums = [*map(sum, known), *map(len, known), len(seen), len(interrupts)]
             sums = sum_over_ranks(torch.tensor(sums, dtype=torch.float64)).tolist()
             new_steps, stopped = int(sums[-2]), sums[-1] > 0  # one Ctrl-C stops all ranks
             update, steps = update + 1, steps + new_steps

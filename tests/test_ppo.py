@@ -160,11 +160,9 @@ def rollout(model, rows=64):
     generator = torch.Generator().manual_seed(1)
     obs = torch.randn(rows, model.kwargs["obs_dim"], generator=generator)
     noise = torch.randn(rows, model.kwargs["act_dim"], generator=generator)
-    with torch.no_grad():
-        actions = model.act(obs, noise)
-        log_prob = model.log_prob(obs, actions)
+    actions, log_prob = model.act(obs, noise)
     advantages, returns = torch.randn(2, rows, generator=generator)
-    return [obs, actions, log_prob, advantages, returns]
+    return [model.views(obs), actions, log_prob, advantages, returns]
 
 
 def optimiser_of(model):
@@ -209,7 +207,12 @@ def test_log_prob_is_that_of_torch():
     torch.nn.init.normal_(model.free_log_std)
     obs, actions = torch.randn(6, 5, 4), torch.randn(6, 5, 3)
     normal = torch.distributions.Normal(model.mean(obs), model.log_std().exp())
-    torch.testing.assert_close(model.log_prob(obs, actions), normal.log_prob(actions).sum(-1))
+    log_prob, values = model.evaluate(model.views(obs), actions)
+    torch.testing.assert_close(log_prob, normal.log_prob(actions).sum(-1))
+    torch.testing.assert_close(values, model.value(obs))
+    acted, log_prob = model.act(obs, noise := torch.randn(6, 5, 3))
+    torch.testing.assert_close(acted, normal.mean + normal.stddev * noise)
+    torch.testing.assert_close(log_prob, normal.log_prob(acted).sum(-1))
 
 
 def test_actions_have_the_mean_and_the_std():
@@ -220,7 +223,7 @@ def test_actions_have_the_mean_and_the_std():
         ActorCritic(2, 2, init_std=(0.5, 2.0, 1.0))
     model = ActorCritic(2, 2, init_std=0.5)
     noise = torch.tensor([[1.0, -2.0]])
-    moved = model.act(torch.ones(1, 2), noise) - torch.from_numpy(model.mean_action(np.ones(2)))
+    moved = model.act(torch.ones(1, 2), noise)[0] - torch.from_numpy(model.mean_action(np.ones(2)))
     assert moved.tolist()[0] == pytest.approx([0.5, -1.0], abs=1e-6)
 
 
@@ -294,7 +297,7 @@ def test_normaliser_is_numpys_mean_and_std_and_travels_with_the_model():
     np.testing.assert_allclose(state["obs_mean"], exact.mean(0), rtol=1e-12)
     std = (state["obs_sum_sq"] / state["count"]).sqrt()
     np.testing.assert_allclose(std, exact.std(0), rtol=1e-4, atol=1e-3)
-    views = model.views(torch.from_numpy(data))[0]
+    views = model.views(torch.from_numpy(data))[:, 0]
     assert views[:, :2].std(0, correction=0).tolist() == pytest.approx([1, 1], rel=1e-2)
     assert views[:, 2].abs().max() < 1e-3  # a constant says nothing, instead of exploding
     absurd = model.mean_action(np.array([1e30, -1e30, 1e4], np.float32))
@@ -635,10 +638,10 @@ def one_update(rows):
     """Statistics and first gradient step from some rows of a fixed rollout."""
     torch.manual_seed(0)
     model = ActorCritic(5, 2, (3, 1), (16,), (16,))
-    batch = [x[rows] for x in rollout(model)]
+    batch = [x[rows] for x in rollout(model)]  # without a mirror or statistics, views are obs
     config = PPOConfig(update_epochs=1, num_minibatches=1)
     stats = ppo_update(model, optimiser_of(model), batch, config, torch.Generator())
-    model.update_normaliser(batch[0])
+    model.update_normaliser(batch[0][:, 0])
     return [stats, model.actor.head.bias.grad.clone(), states(model)]
 
 
