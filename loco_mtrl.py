@@ -87,6 +87,9 @@ def robot_urdf(visual):
             ET.SubElement(contact, "lateral_friction", value="1")
         if name == "chassis":
             _replace(collision, (-0.0125, 0, -0.016), (0, 0, 1), "box", size="0.577 0.28 0.188")
+            for lens in (LIDAR_FRONT, LIDAR_REAR):
+                housing = ET.SubElement(link, "collision")
+                _replace(housing, lens, (0, 0, 1), "sphere", radius=str(HOUSING))
         elif name.endswith("hip_motor"):
             link.remove(collision)  # inside the chassis box, but for a centimetre
         elif name.endswith("upper_leg"):
@@ -113,9 +116,11 @@ def _capsule(collision, end, radius):
 
 # ------------------------------------------------------------------------------- the senses
 
-LIDAR_RANGE = 3.0  # m
+LIDAR_RANGE = 5.0  # m
 LIDAR_EVERY = 2  # control steps from one scan to the next: it turns at 15 Hz, as real ones do
 LIDAR_FRONT, LIDAR_REAR = (0.36, 0.0, 0.08), (-0.38, 0.0, 0.08)  # m, of the two sensors
+HOUSING = 0.04  # m, radius of the ball around each: without it, a lens would enter whatever thin
+# thing the robot runs into, and see nothing of it any more
 # Degrees. Steep rays see the ground that the front feet are about to meet, level ones see walls.
 LIDAR_ELEVATIONS = (-84, -70, -57, -45, -34, -25, -17, -10, -3, 8)
 # The columns on the left, from ahead to behind, densest ahead, then the first of the right side.
@@ -186,7 +191,7 @@ class LocoEnv(gymnasium.Env):
     ## Observation: Box((332,), float32), in the order of section 2.1
     | entries | meaning | unit |
     |---|---|---|
-    | 240 | r, LiDAR scan: distance / 3 m, 1 = nothing hit; rows from low to high, left to right | |
+    | 240 | r, LiDAR scan: distance / 5 m, 1 = nothing hit; rows from low to high, left to right | |
     | 48 | memory: time spent lately 0.7 m and 2 m away along each column, log scale; ours | |
     | 1 | g_d, distance to the goal | m |
     | 1 | g_h, heading of the goal relative to the robot's, left positive | rad |
@@ -278,6 +283,7 @@ class LocoEnv(gymnasium.Env):
             p.configureDebugVisualizer(p.COV_ENABLE_GUI, 0)
         for name in HOT:  # BulletClient looks a function up anew for each call, which costs 3 us
             setattr(p, name, getattr(p, name))
+        p.setGravity(0, 0, -GRAVITY)
         p.setPhysicsEngineParameter(fixedTimeStep=DT, numSubSteps=SUBSTEPS, numSolverIterations=20,
                                     enableConeFriction=0, deterministicOverlappingPairs=1)
         # Side by side, farther apart than the LiDAR reaches: a reset only moves the robot.
@@ -374,10 +380,6 @@ class LocoEnv(gymnasium.Env):
         if self.generator:
             self.generator.reset(rng.uniform(0, 2 * np.pi))
             self.target = self.generator.step(np.zeros(self.generator.action_size), 0.0)
-        way, level = rng.uniform(0, 2 * math.pi), GRAVITY * math.sin(terrain.tilt)
-        self.gravity = (level * math.cos(way), level * math.sin(way),
-                        -GRAVITY * math.cos(terrain.tilt))
-        p.setGravity(*self.gravity)
         self.action = np.zeros(self.action_space.shape)
         position = self.origin + [x, y, z + BASE_HEIGHT + 0.02]
         p.resetBasePositionAndOrientation(self.robot, position, _about_z(yaw))
@@ -459,8 +461,7 @@ class LocoEnv(gymnasium.Env):
         wx, wy, wz = self.rates
         state += [r[i] * wx + r[3 + i] * wy + r[6 + i] * wz for i in range(3)]
         if not self.paper:
-            gx, gy, gz = self.gravity
-            state += [(r[i] * gx + r[3 + i] * gy + r[6 + i] * gz) / GRAVITY for i in range(2)]
+            state += [-r[6], -r[7]]
         state += [joint[0] for joint in p.getJointStates(self.robot, self.joints)]
         state += self.target.tolist()
         if self.generator:

@@ -106,7 +106,6 @@ class Terrain:
     goals: np.ndarray  # (K, 3) x, y, ground z
     height: Callable  # height(x, y) -> ground z, arrays or scalars; -inf outside
     people: tuple[Person, ...] = ()
-    tilt: float = 0.0  # rad by which each episode tips the ground, some way: gravity turns instead
 
 
 # ---------------------------------------------------------------- meshes
@@ -386,12 +385,19 @@ def slopes(rng, difficulty):
     return rng.choice([-1, 1]) * np.interp(U, [a - up, a, b, b + down], [0, top, top, 0])
 
 
-def inclines(rng, difficulty):
-    """Smooth ground tipped by up to 30 degrees, whichever way, with up to 10 boulders."""
-    return _boxes(rng, 10 * difficulty, (1, 3), (0.05, 0.4))
+def hills(rng, difficulty):
+    """Hills and hollows of many sizes, slopes to about 34 degrees, and up to 25 boulders on them."""
+    shape, fine = (2 * SHAPE[0], 2 * SHAPE[1]), np.ones((2, 2))
+    coarse = rng.integers(2, 5, 2)
+    ground = sum(_noise(rng, shape, coarse * 2**k + 1) / 2.3**k for k in range(3))
+    slope = np.percentile(np.hypot(*np.gradient(ground, L / 2)), 95)
+    x = np.abs(np.arange(shape[0]) - (shape[0] - 1) / 2) * L / 2  # m from the middle
+    ground *= np.clip((SPAN / 2 - x) / 1.5, 0, 1)[:, None]  # level where episodes start
+    ground *= np.tan(np.radians(34 * difficulty)) / slope
+    return ground + np.kron(_boxes(rng, 25 * difficulty, (1, 3), (0.05, 0.4)), fine)
 
 
-inclines.tilt = np.radians(30)  # at difficulty 1; pillars have level tops, and slopes do not
+hills.cell = L / 2  # m: steps so low that slopes feel, and look to the LiDAR, nearly smooth
 
 
 def pyramids_up(rng, difficulty):
@@ -571,7 +577,7 @@ for _task in (obstacles, poles, corridors, walls, rooms, mazes, screens, traps):
 PILLAR_TASKS = {
     task.__name__: task
     for task in (
-        flat, rugged, holes, obstacles, poles, stairs, stones, slopes, inclines, pyramids_up,
+        flat, rugged, holes, obstacles, poles, stairs, stones, slopes, hills, pyramids_up,
         pyramids_down, gaps, hurdles, ridges, pits, coasts, corridors, walls, rooms, mazes,
         screens, traps, blocks, waves, crags,
     )
@@ -583,8 +589,8 @@ def make_terrain(task, rng, difficulty):
 
     task: a name in PILLAR_TASKS, a function (rng, difficulty) -> heights (m, n) in m, or a
     finished Terrain, which is returned as it is. rng: numpy Generator; difficulty: in [0, 1].
-    A function may have attributes: `cell`, m, the pillars' cross-section if it is not L; `tilt`,
-    rad at difficulty 1 (Terrain.tilt); `fence`, walls along the border that grow with difficulty.
+    A function may have attributes: `cell`, m, the pillars' cross-section if it is not L, and
+    `fence`, walls along the border that grow with difficulty.
     The strips at both ends are made level, for the episodes to start there; goals lie 6-9 m away.
     Raises ValueError for an unknown task, a difficulty outside [0, 1], heights that are not a
     finite 2-D array, and a task that yields no route in TRIES draws.
@@ -614,8 +620,7 @@ def make_terrain(task, rng, difficulty):
             yaw = routes[0][2::3, 3]
             yaw += rng.uniform(-np.pi, np.pi, len(yaw))
             mesh = fuse_pillars(heights, cell, cell)
-            tilt = difficulty * getattr(generate, "tilt", 0.0)
-            return Terrain(name, *mesh, *routes, ground, tilt=tilt)
+            return Terrain(name, *mesh, *routes, ground)
     raise ValueError(f"task {name!r} gave no walkable route in {TRIES} draws of {heights.shape}")
 
 

@@ -92,12 +92,6 @@ def test_imu_tells_where_down_is(flat):
     place(flat, 6, 0, 0.5, yaw=1.0, roll=0.3)  # the left side is higher: down is to the right
     tilt = flat._observe()[N_SCAN + 5 : N_SCAN + 7]
     np.testing.assert_allclose(tilt, [0.0, -np.sin(0.3)], atol=1e-6)
-    level = terrain.make_terrain("inclines", np.random.default_rng(0), 1.0)  # gravity turns instead
-    with closing(LocoEnv(level)) as env:
-        env.reset(seed=0)
-        tilt = place(env, 6, 0, 0.5)[N_SCAN + 5 : N_SCAN + 7]
-        assert np.hypot(*tilt) == pytest.approx(np.sin(np.radians(30)), abs=1e-6)
-        np.testing.assert_allclose(tilt, np.divide(env.gravity[:2], 9.81), atol=1e-6)
 
 
 @settings(max_examples=20, deadline=None)
@@ -125,7 +119,8 @@ def test_lidar_sees_a_wall_at_its_distance():
         to_floor = np.where(directions[:, 2] < 0, -z / directions[:, 2], np.inf)
     inside = np.abs(y + to_wall.clip(0, 9) * directions[:, 1] + 0.8) < 3.1
     expected = np.minimum(np.where(inside, to_wall, np.inf), to_floor).clip(0, LIDAR_RANGE)
-    compared = inside | ~np.isfinite(to_wall)
+    on_terrain = np.abs(y + to_floor.clip(0, LIDAR_RANGE) * directions[:, 1]) < 4
+    compared = inside | ~np.isfinite(to_wall) & on_terrain
     np.testing.assert_allclose(scan[compared], expected[compared] / LIDAR_RANGE, atol=2e-4)
     assert (expected[compared] == to_wall[compared]).sum() > 30
     env.close()
@@ -176,6 +171,31 @@ def test_lidar_never_sees_the_robot(flat):
     seen = [hit[0] for hit in flat.bullet.rayTestBatch(starts.tolist(), ends.tolist())]
     assert flat.robot in seen  # without the filter it would see its leg
     np.testing.assert_array_equal(flat._observe()[:N_RAYS], before)
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_lidar_still_sees_a_thin_wall_that_it_touches(side):
+    """A lens that entered what the robot leans on would be blind to it."""
+    heights = np.zeros((200, 60))
+    heights[100] = 1.0  # from x = 5 m on, 5 cm thick
+    mesh, ground = terrain.fuse_pillars(heights, 0.05, 0.1), terrain.Ground(heights, (0.05, 0.1))
+    start, goal = np.array([[5.0, 0.0, 0.0, 0.0]]), np.array([[9.0, 0.0, 0.0]])
+    row = loco_mtrl.LIDAR_ELEVATIONS.index(-3)
+    column = np.abs(loco_mtrl.LIDAR_AZIMUTHS[row]).argsort()[0 if side > 0 else -1]
+    with closing(LocoEnv(terrain.Terrain("thin", *mesh, start, goal, ground))) as env:
+        env.reset(seed=0)
+        place(env, 5.025 - 0.6 * side, 0.0, 0.3)
+        touched = 0
+        for _ in range(40):  # pushed against it, head or tail on
+            push = (400.0 * side, 0, 0), (0, 0, 0), env.bullet.LINK_FRAME
+            env.bullet.applyExternalForce(env.robot, -1, *push)
+            scan = env.step(np.zeros(17))[0][:N_RAYS].reshape(loco_mtrl.LIDAR_AZIMUTHS.shape)
+            if env.steps % loco_mtrl.LIDAR_EVERY == 0:
+                base = env.bullet.getContactPoints(env.robot, linkIndexA=-1)
+                if any(abs(contact[7][0]) > 0.9 for contact in base):
+                    touched += 1
+                    assert LIDAR_RANGE * scan[row, column] < 0.15
+        assert touched > 2
 
 
 def test_the_scan_is_taken_every_other_step(flat):
@@ -329,20 +349,6 @@ def test_tasks_that_fail_get_six_times_the_seconds_of_those_that_succeed(monkeyp
         seconds[env.terrain.name] += env.time
         env.reset()
     assert seconds["rugged"] / seconds["flat"] == pytest.approx(6, rel=0.1)
-    env.close()
-
-
-def test_tipped_ground_is_gravity_turned():
-    env, ways = LocoEnv(["inclines", "flat"], difficulty=0.5), []
-    for seed in range(100):
-        env.reset(seed=seed, options={"terrain": seed % 2})
-        engine = env.bullet.getPhysicsEngineParameters()
-        pull = np.array([engine[f"gravityAcceleration{axis}"] for axis in "XYZ"])
-        assert np.linalg.norm(pull) == pytest.approx(9.81)
-        tilt = 0.0 if seed % 2 else 15.0  # half of 30
-        assert math.degrees(math.acos(min(-pull[2] / 9.81, 1))) == pytest.approx(tilt, abs=1e-4)
-        ways.append(math.atan2(pull[1], pull[0]))
-    assert np.histogram(ways[::2], 4, (-np.pi, np.pi))[0].min() > 5  # every way
     env.close()
 
 
