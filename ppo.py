@@ -348,8 +348,9 @@ def ppo_update(model, optimiser, batch, config, generator):
     """Several epochs of clipped gradient steps on one rollout, on all ranks together.
 
     Args:
-        batch: model.views of observations (B, ...), actions (B, act), old log-probabilities,
-            advantages and returns (B,). B may differ from rank to rank, since each has its own number of reset rows.
+        batch: model.views of observations (B, ...), actions (B, act), old log-densities,
+            advantages and returns (B,). B may differ from rank to rank, since each has its own
+            number of reset rows.
         optimiser: with two parameter groups, the actor's (whose step size it adapts), the critic's.
 
     Returns a dict of plain numbers, the same on every rank: columns of progress.csv.

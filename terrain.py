@@ -386,7 +386,7 @@ def slopes(rng, difficulty):
 
 
 def hills(rng, difficulty):
-    """Hills and hollows of many sizes, slopes to about 34 degrees, and up to 25 boulders on them."""
+    """Hills and hollows of many sizes, slopes to about 34 degrees, and up to 25 boulders."""
     shape, fine = (2 * SHAPE[0], 2 * SHAPE[1]), np.ones((2, 2))
     coarse = rng.integers(2, 5, 2)
     ground = sum(_noise(rng, shape, coarse * 2**k + 1) / 2.3**k for k in range(3))
