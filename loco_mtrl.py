@@ -617,10 +617,12 @@ def train(args):
         return 130
     if int(os.environ.get("RANK", 0)) == 0:
         checkpoint = load_checkpoint(run_dir / "checkpoint.pt")
-        # To be shared: half the bits change an action by less than a thousandth.
+        # To be shared: who acts needs no critic, and half the bits change an action by less than a
+        # thousandth.
         checkpoint["optimiser"] = None
         checkpoint["model"] = {name: tensor.half() if tensor.dtype == torch.float32 else tensor
-                               for name, tensor in checkpoint["model"].items()}
+                               for name, tensor in checkpoint["model"].items()
+                               if not name.startswith("critic.")}
         torch.save(checkpoint, run_dir / "policy.pt")
         print(f"Policy: {run_dir / 'policy.pt'}   Curve: {run_dir / 'curve.png'}")
     return 0

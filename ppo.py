@@ -440,9 +440,9 @@ def load_checkpoint(path):
 
 
 def build_policy(checkpoint):
-    """The ActorCritic in what `load_checkpoint` gave."""
+    """The ActorCritic in what `load_checkpoint` gave; a new critic, if it has none."""
     model = ActorCritic(**checkpoint["kwargs"])
-    model.load_state_dict(checkpoint["model"])
+    model.load_state_dict({**model.critic.state_dict(prefix="critic."), **checkpoint["model"]})
     return model
 
 

@@ -53,7 +53,10 @@ def test_training_leaves_what_a_person_needs(trained):
     assert 0 < float(rows[-1]["steps_per_s"]) and float(rows[-1]["approx_kl"]) >= 0
     config = json.loads((trained / "config.json").read_text())
     assert config["meta"]["tasks"] == ["flat"] and config["ppo"]["seed"] == 0
-    assert (trained / "policy.pt").stat().st_size < 1e6
+    assert (trained / "policy.pt").stat().st_size < 3e5
+    whole, shared = (ppo.load_policy(trained / name)[0] for name in ("checkpoint.pt", "policy.pt"))
+    seen = np.random.default_rng(0).uniform(0, 1, (50, whole.kwargs["obs_dim"]))
+    assert np.abs(whole.mean_action(seen) - shared.mean_action(seen)).max() < 1e-3
 
 
 def test_ctrl_c_saves_and_a_killed_rank_stops_all(tmp_path):
