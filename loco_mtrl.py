@@ -191,7 +191,7 @@ class LocoEnv(gymnasium.Env):
     ## Observation: Box((332,), float32), in the order of section 2.1
     | entries | meaning | unit |
     |---|---|---|
-    | 240 | r, LiDAR scan: distance / 5 m, 1 = nothing hit; rows from low to high, left to right | |
+    | 240 | r, LiDAR scan: sqrt(distance / 5 m), 1: no hit; rows from low to high, left to right | |
     | 48 | memory: time spent lately 0.7 m and 2 m away along each column, log scale; ours | |
     | 1 | g_d, distance to the goal | m |
     | 1 | g_h, heading of the goal relative to the robot's, left positive | rad |
@@ -471,7 +471,8 @@ class LocoEnv(gymnasium.Env):
         if turn_lidar and self.lidar:
             self.hits = p.rayTestBatch(*self._rays, parentObjectUniqueId=self.robot,
                                        parentLinkIndex=-1, collisionFilterMask=STATIC_GROUP)
-            self.scan[:N_RAYS] = list(map(HIT_FRACTION, self.hits))
+            # The root: as fine as a scan of 3 m is near by, and yet it looks across a room.
+            self.scan[:N_RAYS] = np.sqrt(list(map(HIT_FRACTION, self.hits)))
         if turn_lidar and not self.paper:
             self.scan[self.scan.size - len(MEMORY_POINTS) :] = self._been_there(r)
         observation[: self.scan.size] = self.scan
