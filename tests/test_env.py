@@ -27,6 +27,11 @@ def wall_ahead(rng, difficulty):
     return heights
 
 
+def metres(observation):
+    """The distances (m) behind a scan, (N_RAYS,)."""
+    return LIDAR_RANGE * observation[:N_RAYS] ** 2
+
+
 @pytest.fixture(scope="module")
 def flat():
     env = LocoEnv("flat")
@@ -98,18 +103,18 @@ def test_imu_tells_where_down_is(flat):
 @given(st.floats(0.2, 0.9), st.floats(-3, 3))
 def test_lidar_over_a_plane(plane, height, yaw):
     plane.reset(seed=0)
-    scan = place(plane, 15.0, 0.0, height, yaw)[:N_RAYS]
+    seen = metres(place(plane, 15.0, 0.0, height, yaw))
     with np.errstate(divide="ignore"):
         drop = -loco_mtrl.lidar_rays()[1][:, 2]
-        expected = np.where(drop > 0, (height + LIDAR_FRONT[2]) / drop / LIDAR_RANGE, 1.0)
-    np.testing.assert_allclose(scan, np.minimum(expected, 1.0), atol=2e-4)
+        expected = np.where(drop > 0, (height + LIDAR_FRONT[2]) / drop, np.inf)
+    np.testing.assert_allclose(seen, np.minimum(expected, LIDAR_RANGE), atol=1e-3)
 
 
 def test_lidar_sees_a_wall_at_its_distance():
     env = LocoEnv(wall_ahead)
     env.reset(seed=0)
     yaw = 0.3
-    scan = place(env, 4.5, -1.0, 0.5, yaw)[:N_RAYS]
+    seen = metres(place(env, 4.5, -1.0, 0.5, yaw))
     sources, directions = loco_mtrl.lidar_rays()
     turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
     x, y, z = (np.array([4.5, -1.0, 0.5]) + sources @ turn.T).T
@@ -121,7 +126,7 @@ def test_lidar_sees_a_wall_at_its_distance():
     expected = np.minimum(np.where(inside, to_wall, np.inf), to_floor).clip(0, LIDAR_RANGE)
     on_terrain = np.abs(y + to_floor.clip(0, LIDAR_RANGE) * directions[:, 1]) < 4
     compared = inside | ~np.isfinite(to_wall) & on_terrain
-    np.testing.assert_allclose(scan[compared], expected[compared] / LIDAR_RANGE, atol=2e-4)
+    np.testing.assert_allclose(seen[compared], expected[compared], atol=1e-3)
     assert (expected[compared] == to_wall[compared]).sum() > 30
     env.close()
 
@@ -142,11 +147,11 @@ def test_lidar_sees_a_person_where_he_is_and_as_he_moves():
     for seconds in (0.0, 0.5, 1.0, 2.5):
         env.time = seconds
         env._move_people()
-        scan = place(env, 3.6, 0.0, 0.4, yaw)[:N_RAYS].reshape(loco_mtrl.LIDAR_AZIMUTHS.shape)
+        seen = metres(place(env, 3.6, 0.0, 0.4, yaw)).reshape(loco_mtrl.LIDAR_AZIMUTHS.shape)
         centre = 7.0 - seconds if seconds <= 2 else 5.0 + (seconds - 2)
         along = centre - sensor[0] - np.sqrt(terrain.PERSON_RADIUS**2 - sensor[1] ** 2)
-        expected = min(along / np.cos(np.radians(3)) / LIDAR_RANGE, 1.0)
-        assert scan[row, column] == pytest.approx(expected, abs=2e-3)
+        expected = min(along / np.cos(np.radians(3)), LIDAR_RANGE)
+        assert seen[row, column] == pytest.approx(expected, abs=0.01)
     env.close()
 
 
@@ -189,12 +194,12 @@ def test_lidar_still_sees_a_thin_wall_that_it_touches(side):
         for _ in range(40):  # pushed against it, head or tail on
             push = (400.0 * side, 0, 0), (0, 0, 0), env.bullet.LINK_FRAME
             env.bullet.applyExternalForce(env.robot, -1, *push)
-            scan = env.step(np.zeros(17))[0][:N_RAYS].reshape(loco_mtrl.LIDAR_AZIMUTHS.shape)
+            seen = metres(env.step(np.zeros(17))[0]).reshape(loco_mtrl.LIDAR_AZIMUTHS.shape)
             if env.steps % loco_mtrl.LIDAR_EVERY == 0:
                 base = env.bullet.getContactPoints(env.robot, linkIndexA=-1)
                 if any(abs(contact[7][0]) > 0.9 for contact in base):
                     touched += 1
-                    assert LIDAR_RANGE * scan[row, column] < 0.15
+                    assert seen[row, column] < 0.15
         assert touched > 2
 
 
