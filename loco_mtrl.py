@@ -138,7 +138,7 @@ def lidar_rays():
     """Where the rays start (m) and their unit vectors, (N_RAYS, 3) each in the base frame.
 
     Row by row from the lowest, left to right. They start ahead of the chassis or, those that look
-    back, behind it: rays that start inside a body cost 70 times as much.
+    back, behind it: nearer by 5 cm they would cost a quarter more, for many would cross a leg.
     """
     up, left = np.radians(LIDAR_ELEVATIONS)[:, None], np.radians(LIDAR_AZIMUTHS)
     up, left = (angle.ravel() for angle in np.broadcast_arrays(up, left))
