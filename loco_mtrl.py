@@ -549,7 +549,7 @@ if "LocoMTRL-v0" not in gymnasium.registry:  # run as a script, this file is imp
 # ------------------------------------------------------------------------------- train
 
 REWARD_SCALE = 0.1  # keeps the critic's targets near 1
-MAIN_STEPS = 3_300_000  # of the no-argument run
+MAIN_STEPS = 3_100_000  # of the no-argument run
 SHORT_UNTIL = 400_000  # steps
 HARD = (0.4, 1.0)  # difficulties after that, when it knows how to walk
 # The gait decides these (all but stones are soon done), and the noise of their samples drowns what
