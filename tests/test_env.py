@@ -107,7 +107,7 @@ def test_lidar_over_a_plane(plane, height, yaw):
     with np.errstate(divide="ignore"):
         drop = -loco_mtrl.lidar_rays()[1][:, 2]
         expected = np.where(drop > 0, (height + LIDAR_FRONT[2]) / drop, np.inf)
-    np.testing.assert_allclose(seen, np.minimum(expected, LIDAR_RANGE), atol=1e-3)
+    np.testing.assert_allclose(seen, np.minimum(expected, LIDAR_RANGE), atol=6e-4)
 
 
 def test_lidar_sees_a_wall_at_its_distance():
@@ -126,7 +126,7 @@ def test_lidar_sees_a_wall_at_its_distance():
     expected = np.minimum(np.where(inside, to_wall, np.inf), to_floor).clip(0, LIDAR_RANGE)
     on_terrain = np.abs(y + to_floor.clip(0, LIDAR_RANGE) * directions[:, 1]) < 4
     compared = inside | ~np.isfinite(to_wall) & on_terrain
-    np.testing.assert_allclose(seen[compared], expected[compared], atol=1e-3)
+    np.testing.assert_allclose(seen[compared], expected[compared], atol=6e-4)
     assert (expected[compared] == to_wall[compared]).sum() > 30
     env.close()
 
@@ -151,7 +151,7 @@ def test_lidar_sees_a_person_where_he_is_and_as_he_moves():
         centre = 7.0 - seconds if seconds <= 2 else 5.0 + (seconds - 2)
         along = centre - sensor[0] - np.sqrt(terrain.PERSON_RADIUS**2 - sensor[1] ** 2)
         expected = min(along / np.cos(np.radians(3)), LIDAR_RANGE)
-        assert seen[row, column] == pytest.approx(expected, abs=0.01)
+        assert seen[row, column] == pytest.approx(expected, abs=0.006)
     env.close()
 
 

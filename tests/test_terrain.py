@@ -169,7 +169,8 @@ def test_bad_pillar_sizes_are_named(size):
 def test_tasks_can_be_stood_on_and_walked(task, difficulty):
     place = make_terrain(task, np.random.default_rng(7), difficulty)
     assert np.isfinite(place.vertices).all() and place.triangles.max() < len(place.vertices)
-    assert len(place.triangles) < 6 * place.height.heights.size and place.starts.shape == (8, 4)
+    most = 45_000 if task == "hills" else 16_000  # its pillars are four times as many, none equal
+    assert len(place.triangles) < most and place.starts.shape == (8, 4)
     for k, (start, goal) in enumerate(zip(place.starts, place.goals, strict=True)):
         assert 6 <= np.hypot(*(goal - start[:3])[:2]) <= 9
         assert standable(place.height, start, 0.1)
