@@ -165,7 +165,7 @@ POSITION_GAIN, VELOCITY_GAIN = 0.10, 1.0
 # Share of a new action that takes effect at once, for the generator's parameters and the joints:
 # more would be jitter, less could not react.
 SMOOTHING = np.array([0.2] * TrajectoryGenerator.action_size + [0.5] * 12)
-RESIDUAL = {True: 0.25, False: 0.6}  # rad, largest u_fb with the TG, and without
+RESIDUAL = {True: 0.1, False: 0.6}  # rad, largest u_fb with the TG, and without
 GOAL_RADIUS = 0.5  # m, r_g
 BASE_HEIGHT = 0.30  # m, of the walking base: a goal floats that high over the ground
 EXPLODED = 1e3  # m or rad/s
@@ -549,7 +549,7 @@ if "LocoMTRL-v0" not in gymnasium.registry:  # run as a script, this file is imp
 # ------------------------------------------------------------------------------- train
 
 REWARD_SCALE = 0.1  # keeps the critic's targets near 1
-MAIN_STEPS = 3_100_000  # of the no-argument run
+MAIN_STEPS = 2_400_000  # of the no-argument run
 SHORT_UNTIL = 400_000  # steps
 HARD = (0.4, 1.0)  # difficulties after that, when it knows how to walk
 # The gait decides these (all but stones are soon done), and the noise of their samples drowns what
@@ -558,10 +558,14 @@ BLIND_TASKS = ("rugged", "holes", "stones", "pyramids_up", "pyramids_down", "gap
                "blocks", "waves")
 
 
-def training_env(index, seed, **options):
-    """Environment number `index` over all ranks, with a pool of terrains of its own."""
+def training_env(index, seed, tasks, **options):
+    """Environment number `index` over all ranks: one of the tasks, on terrains of its own.
+
+    So all tasks have the same share of every batch. An env that drew its tasks would spend its
+    time where the robot is stuck until time is up, little where it soon falls.
+    """
     env = gymnasium.make("LocoMTRL-v0", disable_env_checker=True, pool_seed=(seed, index),
-                         **options)
+                         tasks=tasks[index % len(tasks)], terrains=len(tasks), **options)
     return gymnasium.wrappers.TransformReward(env, lambda reward: REWARD_SCALE * reward)
 
 
@@ -587,26 +591,29 @@ def train(args):
     else:
         eyes = [task for task in args.tasks if task not in BLIND_TASKS] or args.tasks
         stages = [(args.tasks, (0, 1), min(SHORT_UNTIL / args.steps, 0.7), 256, 0.995, 1),
-                  (eyes, HARD, 0.4, 512, 0.998, 0.2),
-                  (eyes, HARD, 0.75, 1024, 0.998, 0.14),
-                  (args.tasks, HARD, 1.0, 1024, 0.998, 0.1)]
+                  (eyes, HARD, 0.8, 512, 0.998, 1),
+                  (args.tasks, HARD, 1.0, 1024, 0.998, 0.15)]
     with contextlib.closing(LocoEnv("flat", **options)) as env:
         mirror, scan = env.mirror(), env.scan_shape
     n_tg = TrajectoryGenerator.action_size * args.tg
-    init_std = (0.37,) * n_tg + (0.25,) * 12
+    init_std = (0.37,) * n_tg + (0.37 if args.tg else 0.25,) * 12
     noise_correlation = (0.9,) * n_tg + (0.0,) * 12  # 0.3 s: turns and stops are tried as such
+    ranks = int(os.environ.get("WORLD_SIZE", 1))
     restarted = os.environ.get("TORCHELASTIC_RESTART_COUNT", "0") != "0"  # torchrun, after a crash
     resume, on_update = args.resume or restarted, tensorboard(run_dir) if args.tensorboard else None
     try:
         # Each stage resumes the one before.
         for tasks, difficulty, share, num_steps, gamma, max_std in stages:
+            # At least 20 environments, as many for each task, shared among the ranks.
+            num_envs = math.ceil(len(tasks) * math.ceil(20 / len(tasks)) / ranks)
             config = PPOConfig(
-                total_timesteps=round(share * args.steps), num_envs=10, num_steps=num_steps,
+                total_timesteps=round(share * args.steps), num_envs=num_envs, num_steps=num_steps,
                 num_minibatches=min(num_steps // 50, 16), update_epochs=2, seed=args.seed,
                 checkpoint_every=10_000 // num_steps, exteroceptive=scan,
                 encoder_hidden=(128, 128), trunk_hidden=(128, 128),
                 init_std=init_std, noise_correlation=noise_correlation,
-                gamma=gamma, learning_rate=5e-4, target_kl=0.05, max_std=float(max_std),
+                gamma=gamma, gae_lambda=0.98, max_advantage=1.0, learning_rate=5e-4,
+                target_kl=0.05, max_std=float(max_std),
             )
             make_env = functools.partial(training_env, seed=args.seed, tasks=tasks,
                                          difficulty=difficulty, **options)

@@ -42,6 +42,9 @@ class PPOConfig:
     update_epochs: int = 4  # passes over each rollout
     num_minibatches: int = 4  # gradient steps per pass
     clip_coef: float = 0.2  # a probability ratio earns nothing outside 1 +- clip_coef
+    # Largest advantage, in standard deviations. A few falls and finds, many times the rest, fill
+    # the gradient with noise; bounded, they still say good or bad.
+    max_advantage: float = 10.0
     max_grad_norm: float = 1.0  # for the actor and the critic, each on its own
     learning_rate: float = 3e-4  # the actor's first step size; it then follows target_kl ...
     min_learning_rate: float = 1e-4  # ... but never below this (too small: learning stops)
@@ -361,6 +364,7 @@ def ppo_update(model, optimiser, batch, config, generator):
     a_mean, a_square, r_mean, r_square = (moments[1:] / moments[0]).tolist()
     a_var, r_var = max(a_square - a_mean**2, 0.0), max(r_square - r_mean**2, 0.0)
     advantages = (advantages - a_mean) / (math.sqrt(a_var) + 1e-8)
+    advantages = advantages.clamp(-config.max_advantage, config.max_advantage)
 
     # Every gradient is a view into one flat tensor, with the minibatch's sums behind them: a single
     # all_reduce gives all ranks the gradient, the KL and the number of rows. Ranks may bring
