@@ -583,8 +583,8 @@ def train(args):
     # Tasks, their difficulties, share of all steps done at the end, steps of a rollout, gamma,
     # largest std. Short rollouts learn fastest at first; later the noise of so few samples holds
     # the policy back. A detour pays after many seconds: 200 steps, 1 / (1 - 0.995), are 6.7 s, and
-    # later it is 17 s. Exploration noise finds the gait, but who walks along an edge with so much
-    # of it falls, whatever he learns: it shrinks.
+    # later it is 17 s. At last there is little exploration noise: who is used to much of it is
+    # not at his best without.
     if args.sequential:  # one task after the other (section 3), each for as long
         n = len(args.tasks)
         stages = [([task], (0, 1), (k + 1) / n, 256, 0.995, 1) for k, task in enumerate(args.tasks)]

@@ -14,7 +14,7 @@ from hypothesis.extra.numpy import arrays
 
 import loco_mtrl
 import terrain
-from loco_mtrl import DT, GOAL_RADIUS, LIDAR_FRONT, LIDAR_RANGE, N_RAYS, LocoEnv
+from loco_mtrl import DT, GOAL_RADIUS, LIDAR_FRONT, LIDAR_RANGE, N_RAYS, LocoEnv, training_env
 
 SHAPE = (60, 40)
 N_SCAN = N_RAYS + len(loco_mtrl.MEMORY_POINTS)
@@ -355,6 +355,18 @@ def test_tasks_that_fail_get_six_times_the_seconds_of_those_that_succeed(monkeyp
         env.reset()
     assert seconds["rugged"] / seconds["flat"] == pytest.approx(6, rel=0.1)
     env.close()
+
+
+def test_each_training_environment_has_one_task_and_as_many_layouts_as_there_are_tasks():
+    tasks = ["flat", "rugged", "ridges"]
+    pools = []
+    for index in range(4):
+        with closing(training_env(index, seed=0, tasks=tasks)) as env:
+            pools.append(env.unwrapped.pool)
+    assert [{t.name for t in pool} for pool in pools] == [{tasks[i % 3]} for i in range(4)]
+    assert {len(pool) for pool in pools} == {3}
+    first, second, third = (terrain.vertices.tobytes() for terrain in pools[1])
+    assert len({first, second, third}) == 3
 
 
 def test_every_task_is_drawn_and_named():

@@ -400,6 +400,24 @@ def test_the_noise_never_exceeds_its_bound():
     assert len(stds) >= 2 and max(stds) <= 0.2 + 1e-6
 
 
+def test_advantages_are_bounded(monkeypatch):
+    model = ActorCritic(2, 1)
+    views, actions, log_prob, _, returns = rollout(model, 4)
+    advantages = torch.tensor([0.0, 0.0, 0.0, 8.0])  # mean 2, std sqrt(12)
+    for bound, valid in ((10.0, [-0.577350, 1.732051]), (1.0, [-0.577350, 1.0])):
+        seen = set()
+
+        def spy(log_prob, old, advantages, *rest, seen=seen):
+            seen.update(advantages.tolist())
+            return ppo_loss(log_prob, old, advantages, *rest)
+
+        monkeypatch.setattr(ppo, "ppo_loss", spy)
+        config = PPOConfig(max_advantage=bound, num_minibatches=1, num_envs=1, num_steps=4)
+        ppo_update(model, optimiser_of(model), [views, actions, log_prob, advantages, returns],
+                   config, torch.Generator())
+        assert sorted(seen) == pytest.approx(valid, abs=1e-5)
+
+
 def test_the_noise_lasts_from_step_to_step():
     taken = []
     env = partial(Probe, lambda obs, action, t: taken.append(action) or 0.0, length=10_000)
@@ -469,8 +487,8 @@ def test_rewards_that_are_no_numbers_stop_the_training(reward):
     ("gamma", 1.01, "[0, 1]"), ("gamma", math.nan, "[0, 1]"), ("gae_lambda", -0.1, "[0, 1]"),
     ("clip_coef", 0, "above 0"), ("max_grad_norm", math.inf, "finite"), ("init_std", -1, "above 0"),
     ("noise_correlation", 1.5, "in [0, 1]"), ("noise_correlation", (0.5, -1), "in [0, 1]"),
-    ("max_std", math.nan, "above 0"), ("init_std", (0.1, 0.0), "above 0"),
-    ("init_std", (), "above 0"),
+    ("max_std", math.nan, "above 0"), ("max_advantage", 0.0, "above 0"),
+    ("init_std", (0.1, 0.0), "above 0"), ("init_std", (), "above 0"),
     ("learning_rate", 1.0, "[0.0001, 0.001]"), ("learning_rate", 1e-5, "[0.0001, 0.001]"),
     ("critic_learning_rate", 0.0, "above 0"), ("target_kl", 0.0, "above 0"),
     ("seed", -1, "at least 0"),
