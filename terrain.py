@@ -19,7 +19,8 @@ from numpy.lib.stride_tricks import sliding_window_view
 L = W = 0.2  # m, cross-section of a training pillar
 SHAPE = (60, 40)  # m x n pillars: 12 m x 8 m
 
-CELL = 0.1  # m, navigation grid; a disc of 0.25 m radius is known on it to half a cell
+WAY_CELL = 0.2  # m, grid on which the shortest ways are known
+CELL = WAY_CELL / 2  # m, navigation grid; a disc of 0.25 m radius is known on it to half a cell
 CLIMB = 0.12  # m, highest step that Laikago's feet clear with room to spare
 STEP = 0.2  # m, highest step that they clear at all: what training may ask for
 FLAT = 0.05  # m, most that the ground under a start may vary
@@ -104,8 +105,18 @@ class Terrain:
     triangles: np.ndarray  # (F, 3) int, counter-clockwise seen from outside
     starts: np.ndarray  # (K, 4) x, y, ground z, yaw
     goals: np.ndarray  # (K, 3) x, y, ground z
+    ways: np.ndarray  # (K, nx, ny) m, shortest way to goal k from each cell of WAY_CELL
     height: Callable  # height(x, y) -> ground z, arrays or scalars; -inf outside
     people: tuple[Person, ...] = ()
+
+    def to_go(self, route, x, y):
+        """Length (m) of the shortest way from x, y (m, scalars) to goal `route`, interpolated."""
+        ways = self.ways[route]
+        u, v = x / WAY_CELL - 0.5, y / WAY_CELL + ways.shape[1] / 2 - 0.5
+        u, v = (min(max(a, 0.0), n - 1.001) for a, n in zip((u, v), ways.shape, strict=True))
+        i, j = int(u), int(v)
+        (a, b), (c, d) = ways[i : i + 2, j : j + 2].tolist()
+        return (1 - u + i) * (a + (v - j) * (b - a)) + (u - i) * (c + (v - j) * (d - c))
 
 
 # ---------------------------------------------------------------- meshes
@@ -236,6 +247,30 @@ def _flood(free, start):
     return np.maximum(steps, -1).reshape(free.shape)
 
 
+def _ways(free, goals):
+    """Terrain.ways: shortest ways (m, 8-connected) over `free` to the cells `goals`, (i, j) each.
+
+    Where nothing is free, beside walls and edges, it is the way to the nearest free cell and on.
+    """
+    free = np.pad(free, [(0, n % 2) for n in free.shape])
+    m, n = np.array(free.shape) // 2
+    free = free.reshape(m, 2, n, 2).any((1, 3))
+    ways = np.full((len(goals), m, n), np.inf, np.float32)
+    for k, (i, j) in enumerate(goals):
+        ways[k, i // 2, j // 2] = 0
+
+    def step(ways):
+        wide = np.pad(ways, ((0, 0), (1, 1), (1, 1)), constant_values=np.inf)
+        return np.min([wide[:, i : i + m, j : j + n] + np.float32(WAY_CELL * np.hypot(i - 1, j - 1))
+                       for i in range(3) for j in range(3)], axis=0)
+
+    while ((shorter := np.where(free, step(ways), ways)) != ways).any():
+        ways = shorter
+    while np.isinf(ways).any():
+        ways = np.where(np.isinf(ways), step(ways), ways)
+    return ways
+
+
 def _pick(rng, mask):
     """A random True cell of `mask` as (i, j), or None."""
     cells = np.argwhere(mask)
@@ -244,7 +279,7 @@ def _pick(rng, mask):
 
 def _routes(ground, rng, count, reach, climb=CLIMB, zones=((0, np.inf),), margin=0.5,
             floor=-np.inf):
-    """`count` starts (K, 4) and goals (K, 3) as in Terrain; None: there are none.
+    """`count` starts (K, 4), goals (K, 3) and ways between, as in Terrain; None: there are none.
 
     Start k lies in the k-th of `zones` (ranges of x, taken in turn); a goal lies `reach` = (least,
     most) metres from its start, measured straight; both keep `margin` m from the border and lie
@@ -259,7 +294,7 @@ def _routes(ground, rng, count, reach, climb=CLIMB, zones=((0, np.inf),), margin
     if home is None:
         return None
     met = inside & (_flood(free, home) >= 0)
-    starts, goals = [], []
+    starts, goals, ends = [], [], []
     for k in range(count):
         s = _pick(rng, zones[k % len(zones)] & met)
         if s is None:
@@ -270,7 +305,8 @@ def _routes(ground, rng, count, reach, climb=CLIMB, zones=((0, np.inf),), margin
             return None
         starts.append((x[s], y[s], z[s], np.arctan2(y[g] - y[s], x[g] - x[s])))
         goals.append((x[g], y[g], z[g]))
-    return np.array(starts), np.array(goals)
+        ends.append(g)
+    return np.array(starts), np.array(goals), _ways(free, ends)
 
 
 # ---------------------------------------------------------------- the training tasks

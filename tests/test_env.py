@@ -185,9 +185,10 @@ def test_lidar_still_sees_a_thin_wall_that_it_touches(side):
     heights[100] = 1.0  # from x = 5 m on, 5 cm thick
     mesh, ground = terrain.fuse_pillars(heights, 0.05, 0.1), terrain.Ground(heights, (0.05, 0.1))
     start, goal = np.array([[5.0, 0.0, 0.0, 0.0]]), np.array([[9.0, 0.0, 0.0]])
+    way = np.zeros((1, 50, 30))
     row = loco_mtrl.LIDAR_ELEVATIONS.index(-3)
     column = np.abs(loco_mtrl.LIDAR_AZIMUTHS[row]).argsort()[0 if side > 0 else -1]
-    with closing(LocoEnv(terrain.Terrain("thin", *mesh, start, goal, ground))) as env:
+    with closing(LocoEnv(terrain.Terrain("thin", *mesh, start, goal, way, ground))) as env:
         env.reset(seed=0)
         place(env, 5.025 - 0.6 * side, 0.0, 0.3)
         touched = 0
@@ -236,20 +237,38 @@ def test_memory_drops_a_place_a_second_and_forgets_between_episodes(flat):
     assert flat.trail == [pytest.approx(flat.position[:2])]
 
 
-def test_reward_is_velocity_toward_the_goal_and_sums_to_the_progress():
-    env = LocoEnv("rugged", difficulty=0.35)
+@pytest.mark.parametrize("paper", [True, False])
+def test_reward_is_velocity_toward_the_goal_and_sums_to_the_progress(paper):
+    env = LocoEnv("rugged", difficulty=0.35, paper=paper)
     env.reset(seed=1)
-    first, total = env.distance, 0.0
+
+    def to_go():
+        x, y, _ = np.subtract(env.position, env.origin)
+        return env.distance if paper else env.terrain.to_go(env.route, x, y)
+
+    first, distance, total = to_go(), env.distance, 0.0
     for _ in range(120):
-        before = env.distance
+        before = to_go()
         _, reward, terminated, _, info = env.step(np.zeros(17))
-        assert reward == pytest.approx((before - env.distance) / DT)
+        assert reward == pytest.approx((before - to_go()) / DT)
         total += reward * DT
         assert not terminated
-    assert total == pytest.approx(first - env.distance)
+    assert total == pytest.approx(first - to_go())
     assert total > 0.5  # the zero action has walked toward the goal, and that is positive
-    assert info["t_cr"] == pytest.approx(1 - env.distance / first)
+    assert info["t_cr"] == pytest.approx(1 - env.distance / distance)
     env.close()
+
+
+def test_the_shortest_way_leads_around_a_wall():
+    """The way to an opening and on, by hand; 8-connected ways are up to 8 % longer."""
+    with closing(LocoEnv(wall_ahead)) as env:
+        env.reset(seed=0, options={"route": 0})
+        terrain_, goal = env.terrain, env.terrain.goals[0]
+    x, y, *_ = terrain_.starts[0]
+    assert (x < 6) != (goal[0] < 6)  # the wall is between them, its opening at y > 2.4
+    around = np.hypot(x - 6.2, y - 2.8) + np.hypot(goal[0] - 6.2, goal[1] - 2.8)
+    assert around * 0.97 - 0.3 < terrain_.to_go(0, x, y) < around * 1.09 + 0.4
+    assert terrain_.to_go(0, *goal[:2]) < 0.15
 
 
 def test_zero_action_walks_by_itself(plane):
@@ -277,11 +296,11 @@ def test_success_ends_the_episode_at_the_goal(flat):
 def test_tipping_over_is_a_fall_and_costs_two_metres(paper, cost):
     with closing(LocoEnv("flat", paper=paper)) as env:
         env.reset(seed=0)
-        before = env.distance
+        before = env.to_go
         place(env, *np.subtract(env.position, env.origin)[:2], 0.6, roll=1.4)
         _, reward, terminated, _, info = env.step(np.zeros(17))
         assert terminated and info["fall"] and not info["success"]
-        assert reward * DT == pytest.approx(before - env.distance - cost, abs=0.2)
+        assert reward * DT == pytest.approx(before - env.to_go - cost, abs=1e-6)
 
 
 def test_dropping_off_an_edge_is_a_fall():
