@@ -481,7 +481,8 @@ class LocoEnv(gymnasium.Env):
             self.hits = p.rayTestBatch(*self._rays, parentObjectUniqueId=self.robot,
                                        parentLinkIndex=-1, collisionFilterMask=STATIC_GROUP)
             # The root: as fine as a scan of 3 m is near by, and yet it looks across a room.
-            self.scan[:N_RAYS] = np.sqrt(list(map(HIT_FRACTION, self.hits)))
+            fractions = np.fromiter(map(HIT_FRACTION, self.hits), np.float32, N_RAYS)
+            self.scan[:N_RAYS] = np.sqrt(fractions)
         if turn_lidar and not self.paper:
             self.scan[self.scan.size - len(MEMORY_POINTS) :] = self._been_there(r)
         observation[: self.scan.size] = self.scan
@@ -492,11 +493,12 @@ class LocoEnv(gymnasium.Env):
         x, y, _ = self.position
         if self.time >= len(self.trail):  # one place a second
             self.trail.append((x, y))
+            self.recent = np.array(self.trail[-MEMORY:]).T
         size = math.hypot(r[0], r[3])
-        turn = np.array([[r[0], -r[3]], [r[3], r[0]]]) / size  # its columns are forward and left
-        trail = (np.array(self.trail[-MEMORY:]) - (x, y)) @ turn
-        square = (MEMORY_POINTS**2).sum(1)[:, None] + (trail**2).sum(1)
-        seconds = np.maximum(1 - square + 2 * MEMORY_POINTS @ trail.T, 0).sum(1)
+        forward, left = (r[0] / size, r[3] / size), (-r[3] / size, r[0] / size)
+        px, py = (MEMORY_POINTS @ (forward, left) + (x, y)).T[..., None]
+        dx, dy = px - self.recent[0], py - self.recent[1]  # (points, places) each
+        seconds = np.maximum(1 - dx * dx - dy * dy, 0).sum(1)
         return np.log1p(seconds) / math.log1p(MEMORY)
 
     def render(self):
@@ -590,18 +592,19 @@ def train(args):
             "seed": args.seed, "command": "python loco_mtrl.py " + " ".join(args.argv),
             "commit": _commit()}
     # Tasks, their difficulties, share of all steps done at the end, steps of a rollout, gamma,
-    # largest std. Short rollouts learn fastest at first; later the noise of so few samples holds
+    # target_kl, largest std. Short rollouts learn fastest at first; later the noise of so few samples holds
     # the policy back. A detour pays after many seconds: 200 steps, 1 / (1 - 0.995), are 6.7 s, and
     # later it is 17 s. At last there is little exploration noise: who is used to much of it is
     # not at his best without.
     if args.sequential:  # one task after the other (section 3), each for as long
         n = len(args.tasks)
-        stages = [([task], (0, 1), (k + 1) / n, 256, 0.995, 1) for k, task in enumerate(args.tasks)]
+        stages = [([task], (0, 1), (k + 1) / n, 256, 0.995, 0.05, 1)
+                  for k, task in enumerate(args.tasks)]
     else:
         eyes = [task for task in args.tasks if task not in BLIND_TASKS] or args.tasks
-        stages = [(args.tasks, (0, 1), min(SHORT_UNTIL / args.steps, 0.7), 256, 0.995, 1),
-                  (eyes, HARD, 0.8, 512, 0.998, 1),
-                  (args.tasks, HARD, 1.0, 1024, 0.998, 0.15)]
+        stages = [(args.tasks, (0, 1), min(SHORT_UNTIL / args.steps, 0.7), 256, 0.995, 0.05, 1),
+                  (eyes, HARD, 0.8, 512, 0.998, 0.02, 1),
+                  (args.tasks, HARD, 1.0, 1024, 0.998, 0.02, 0.15)]
     with contextlib.closing(LocoEnv("flat", **options)) as env:
         mirror, scan = env.mirror(), env.scan_shape
     n_tg = TrajectoryGenerator.action_size * args.tg
@@ -612,7 +615,7 @@ def train(args):
     resume, on_update = args.resume or restarted, tensorboard(run_dir) if args.tensorboard else None
     try:
         # Each stage resumes the one before.
-        for tasks, difficulty, share, num_steps, gamma, max_std in stages:
+        for tasks, difficulty, share, num_steps, gamma, target_kl, max_std in stages:
             # At least 20 environments, as many for each task, shared among the ranks.
             num_envs = math.ceil(len(tasks) * math.ceil(20 / len(tasks)) / ranks)
             config = PPOConfig(
@@ -622,7 +625,7 @@ def train(args):
                 encoder_hidden=(128, 128), trunk_hidden=(128, 128),
                 init_std=init_std, noise_correlation=noise_correlation,
                 gamma=gamma, gae_lambda=0.98, max_advantage=1.0, learning_rate=5e-4,
-                target_kl=0.05, max_std=float(max_std),
+                target_kl=target_kl, max_std=float(max_std),
             )
             make_env = functools.partial(training_env, seed=args.seed, tasks=tasks,
                                          difficulty=difficulty, **options)

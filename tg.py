@@ -147,7 +147,8 @@ class TrajectoryGenerator:
         pairs = zip(PARAMETERS.values(), self.scaled, strict=True)
         self.parameters = [centre + half * scaled for (centre, half), scaled in pairs]
         self.phase = (self.phase + 2 * math.pi * self.parameters[0] * dt) % (2 * math.pi)
-        return np.array([_leg_angles(k, *foot) for k, foot in enumerate(self._feet())]).ravel()
+        legs = enumerate(self._feet())
+        return np.array([angle for k, foot in legs for angle in _leg_angles(k, *foot)])
 
     def feet(self):
         """Foot targets (4, 3) in the hip frames at the present phase and parameters, m."""
