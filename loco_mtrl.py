@@ -592,10 +592,10 @@ def train(args):
             "seed": args.seed, "command": "python loco_mtrl.py " + " ".join(args.argv),
             "commit": _commit()}
     # Tasks, their difficulties, share of all steps done at the end, steps of a rollout, gamma,
-    # target_kl, largest std. Short rollouts learn fastest at first; later the noise of so few samples holds
-    # the policy back. A detour pays after many seconds: 200 steps, 1 / (1 - 0.995), are 6.7 s, and
-    # later it is 17 s. At last there is little exploration noise: who is used to much of it is
-    # not at his best without.
+    # target_kl, largest std. Short rollouts and large steps learn fastest at first; later the noise
+    # of so few samples holds the policy back. A detour pays after many seconds: 200 steps,
+    # 1 / (1 - 0.995), are 6.7 s, and later it is 17 s. At last there is little exploration noise:
+    # who is used to much of it is not at his best without.
     if args.sequential:  # one task after the other (section 3), each for as long
         n = len(args.tasks)
         stages = [([task], (0, 1), (k + 1) / n, 256, 0.995, 0.05, 1)
