@@ -493,11 +493,11 @@ class LocoEnv(gymnasium.Env):
         x, y, _ = self.position
         if self.time >= len(self.trail):  # one place a second
             self.trail.append((x, y))
-            self.recent = np.array(self.trail[-MEMORY:]).T
         size = math.hypot(r[0], r[3])
         forward, left = (r[0] / size, r[3] / size), (-r[3] / size, r[0] / size)
         px, py = (MEMORY_POINTS @ (forward, left) + (x, y)).T[..., None]
-        dx, dy = px - self.recent[0], py - self.recent[1]  # (points, places) each
+        xs, ys = np.array(self.trail[-MEMORY:]).T
+        dx, dy = px - xs, py - ys  # (points, places) each
         seconds = np.maximum(1 - dx * dx - dy * dy, 0).sum(1)
         return np.log1p(seconds) / math.log1p(MEMORY)
 
