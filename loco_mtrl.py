@@ -608,6 +608,7 @@ def train(args):
     with contextlib.closing(LocoEnv("flat", **options)) as env:
         mirror, scan = env.mirror(), env.scan_shape
     n_tg = TrajectoryGenerator.action_size * args.tg
+    # Without the generator the joints' actions are worth six times as many radians.
     init_std = (0.37,) * n_tg + (0.37 if args.tg else 0.25,) * 12
     noise_correlation = (0.9,) * n_tg + (0.0,) * 12  # 0.3 s: turns and stops are tried as such
     ranks = int(os.environ.get("WORLD_SIZE", 1))
