@@ -39,7 +39,7 @@ from terrain import (
     make_terrain,
     make_world,
 )
-from tg import LEGS, STANDING, TrajectoryGenerator
+from tg import CENTRE, LEGS, RANGE, STANDING, TrajectoryGenerator
 
 
 @contextlib.contextmanager
@@ -210,9 +210,7 @@ class LocoEnv(gymnasium.Env):
 
     ## Reward
     (d_{t-1} - d_t) / dt, the velocity toward the goal, m/s. The paper prints the opposite sign but
-    calls it the velocity toward the target. There d is the straight distance, which has dead ends;
-    here it is the length of the shortest way around what the legs cannot climb, and a fall costs
-    2 m / dt. Both are ours, and only training knows that way: paper=True leaves them out.
+    calls it the velocity toward the target. A fall costs 2 m / dt: ours, paper=True leaves it out.
 
     ## Episode
     It terminates at the goal (base within 0.5 m) and in a fall (base tipped by over 60 degrees or
@@ -227,7 +225,7 @@ class LocoEnv(gymnasium.Env):
             of these; None: all pillar tasks. Each episode draws one; the policy is not told which.
         difficulty: in [0, 1], or (low, high) to draw it from, once for each terrain.
         tg, lidar: the paper's ablations (section 3) leave one of them out.
-        paper: the paper's own state and reward: no memory, no tilt, straight, no cost of a fall.
+        paper: the paper's own state and reward: no memory, no tilt, no cost of a fall.
         terrains: how many terrains of each task to build; Bullet never frees a mesh, so the pool
             is built once and episodes draw from it. A finished Terrain counts once.
         pool_seed: seeds the pool; `reset(seed=...)` seeds all else.
@@ -393,7 +391,7 @@ class LocoEnv(gymnasium.Env):
             p.resetBasePositionAndOrientation(body, (0, 0, -1000), (0, 0, 0, 1))
         self._move_people()
         observation = self._observe()
-        self.start_distance, self.to_go = self.distance, self._to_go()
+        self.start_distance = self.distance
         if self.visual:
             p.resetBasePositionAndOrientation(self.flag, self.goal, (0, 0, 0, 1))
             dx, dy, _ = np.subtract(self.goal, self.position)
@@ -424,7 +422,7 @@ class LocoEnv(gymnasium.Env):
             self._move_people()
 
         self.steps += 1
-        distance, to_go = self.distance, self.to_go
+        distance = self.distance
         observation = self._observe(self.steps % LIDAR_EVERY == 0)
         if not math.hypot(self.distance, *self.rates) < EXPLODED:  # not: NaN compares to nothing
             p.removeBody(self.robot)
@@ -434,16 +432,8 @@ class LocoEnv(gymnasium.Env):
         success = self.distance < GOAL_RADIUS
         fall = self.up < FALL_UP or self.velocity[2] < -FALL_SPEED
         cost = FALL_COST if fall and not success and not self.paper else 0.0
-        self.to_go = self._to_go()
-        reward = (to_go - self.to_go - cost) / DT
+        reward = (distance - self.distance - cost) / DT
         return observation, reward, success or fall, False, self._info(success, fall)
-
-    def _to_go(self):
-        """The distance that the reward counts, m."""
-        if self.paper:
-            return self.distance
-        x, y, _ = self.position
-        return self.terrain.to_go(self.route, x - self.origin[0], y)
 
     def _info(self, success, fall):
         progress = 1.0 if success else 1.0 - self.distance / self.start_distance
@@ -465,7 +455,8 @@ class LocoEnv(gymnasium.Env):
         self.position, self.up = position, r[8]
         self.distance = math.dist(self.goal, position)
         heading = math.atan2(self.goal[1] - position[1], self.goal[0] - position[0])
-        heading -= math.atan2(r[3], r[0])
+        self.yaw = math.atan2(r[3], r[0])
+        heading -= self.yaw
         state = [self.distance, (heading + math.pi) % (2 * math.pi) - math.pi]
         wx, wy, wz = self.rates
         state += [r[i] * wx + r[3 + i] * wy + r[6 + i] * wz for i in range(3)]
@@ -557,11 +548,76 @@ if "LocoMTRL-v0" not in gymnasium.registry:  # run as a script, this file is imp
     gymnasium.register("LocoMTRL-v0", "loco_mtrl:LocoEnv", max_episode_steps=MAX_EPISODE_STEPS)
 
 
+# ------------------------------------------------------------------------------- the guide
+
+PACE = 0.21  # m, the guide's stride where its way is straight
+PATIENCE = 5.0  # s without getting on, after which he takes the robot by the hand
+
+
+class Guide(gymnasium.Wrapper):
+    """Tells a robot in training the way: info["guide"] is what one who knows the map would do.
+
+    He walks the trajectory generator along `Terrain.ways`, and turns where they turn. He is no part
+    of the policy, only of what it learns from: to recognise, in what its own senses tell, which way
+    he would go. (n_act,), NaN for all but the two strides: the rest it finds out for itself.
+
+    If he `leads`, he takes a robot that has not got on for PATIENCE by the hand, until it is
+    half a metre nearer than it has ever been: one that is stuck has little to teach. What info
+    says of the episode then remains what it was when it last walked alone.
+    """
+
+    def __init__(self, env, leads=False):
+        super().__init__(env)
+        self.may_lead = leads
+
+    def reset(self, **kwargs):
+        observation, info = self.env.reset(**kwargs)
+        self.nearest, self.since, self.leads, self.verdict = math.inf, 0.0, False, {}
+        return observation, self._guided(info)
+
+    def step(self, action):
+        if self.leads:
+            action = np.where(np.isnan(self.advice), action, self.advice)
+        *rest, info = self.env.step(action)
+        return *rest, self._guided(info)
+
+    def _guided(self, info):
+        env = self.unwrapped
+        self.advice = self._advise(env)
+        if env.exploded:
+            return info | {"guide": self.advice}
+        x, y, _ = np.subtract(env.position, env.origin).tolist()
+        to_go = env.terrain.to_go(env.route, x, y)[0]
+        if to_go < self.nearest - 0.5:
+            self.nearest, self.since, self.leads = to_go, env.time, False
+        elif self.may_lead and env.time > self.since + PATIENCE and not self.leads:
+            self.leads = True
+            # What the robot would have reached alone, once and for all.
+            self.verdict = self.verdict or {"t_cr": info["t_cr"], "success": False}
+        return info | self.verdict | {"guide": self.advice}
+
+    def _advise(self, env):
+        advice = np.full(env.action.shape, np.nan)
+        if env.exploded:
+            return advice
+        x, y, _ = np.subtract(env.position, env.origin).tolist()
+        to_x, to_y, _ = np.subtract(env.goal, env.origin).tolist()
+        if env.distance > 0.7:
+            to_x, to_y = env.terrain.ahead(env.route, x, y)
+        turn = math.remainder(math.atan2(to_y - y, to_x - x) - env.yaw, 2 * math.pi)
+        # The strides: slower in a bend, on the spot where the way lies to the side or behind.
+        forward = PACE * max(0.0, math.cos(turn)) ** 2
+        aside = 0.2 * min(max(1.2 * turn, -1.0), 1.0)
+        strides = np.array([forward - aside, forward + aside])
+        advice[1:3] = np.clip((strides - CENTRE[1:3]) / RANGE[1:3], -0.95, 0.95)
+        return advice
+
+
 # ------------------------------------------------------------------------------- train
 
 REWARD_SCALE = 0.1  # keeps the critic's targets near 1
 MAIN_STEPS = 3_000_000  # of the no-argument run
-SHORT_UNTIL = 400_000  # steps
+SHORT_UNTIL = 200_000  # steps
 HARD = (0.4, 1.0)  # difficulties after that, when it knows how to walk
 # The gait decides these (all but stones are soon done), and the noise of their samples drowns what
 # the others teach, which need eyes: they rest between the first and the last part.
@@ -569,15 +625,49 @@ BLIND_TASKS = ("rugged", "holes", "stones", "pyramids_up", "pyramids_down", "gap
                "blocks", "waves")
 
 
-def training_env(index, seed, tasks, **options):
+def training_env(index, seed, tasks, guide=None, **options):
     """Environment number `index` over all ranks: one of the tasks, on terrains of its own.
 
     So all tasks have the same share of every batch. An env that drew its tasks would spend its
-    time where the robot is stuck until time is up, little where it soon falls.
+    time where the robot is stuck until time is up, little where it soon falls. guide: None, or
+    that he "speaks" or "leads", see Guide.
     """
     env = gymnasium.make("LocoMTRL-v0", disable_env_checker=True, pool_seed=(seed, index),
                          tasks=tasks[index % len(tasks)], terrains=len(tasks), **options)
+    env = Guide(env, guide == "leads") if guide else env
     return gymnasium.wrappers.TransformReward(env, lambda reward: REWARD_SCALE * reward)
+
+
+def plan(args):
+    """The stages of a training: (tasks, difficulties, share of all steps done at its end, settings)
+
+    With a guide the policy first does as he does, by large steps that no noise of rewards misleads.
+    Then, and without a guide from the beginning, it learns by PPO.
+    """
+    eyes = [task for task in args.tasks if task not in BLIND_TASKS] or args.tasks
+    # Short rollouts and large steps learn fastest at first; later the noise of so few samples holds
+    # the policy back. A detour pays after many seconds: 200 steps, 1 / (1 - 0.995), are 6.7 s, and
+    # later it is 17 s. At last there is little exploration noise: who is used to much of it is not
+    # at his best without.
+    first = dict(num_steps=256, gamma=0.995, update_epochs=2, learning_rate=5e-4, target_kl=0.05)
+    middle = first | dict(num_steps=512, gamma=0.998, target_kl=0.02)
+    last = middle | dict(num_steps=1024, max_std=0.15)
+    start = min(SHORT_UNTIL / args.steps, 0.7)
+    if args.guide and args.tg and not args.paper:
+        follow = dict(guide_share=1.0, update_epochs=3, target_kl=1e9)
+        first |= follow | dict(max_std=0.2) | _constant(1e-3)
+        middle |= follow | dict(max_std=0.15) | _constant(5e-4)
+        last |= dict(guide_share=0.5, min_learning_rate=1e-5, learning_rate=5e-5,
+                     max_learning_rate=1e-4)
+    if args.sequential:  # one task after the other (section 3), each for as long
+        n = len(args.tasks)
+        return [([task], (0, 1), (k + 1) / n, first) for k, task in enumerate(args.tasks)]
+    return [(args.tasks, (0, 1), start, first), (eyes, HARD, 0.8, middle),
+            (args.tasks, HARD, 1.0, last)]
+
+
+def _constant(step):
+    return dict(learning_rate=step, min_learning_rate=step, max_learning_rate=step)
 
 
 def train(args):
@@ -588,23 +678,10 @@ def train(args):
             load_checkpoint(run_dir / "checkpoint.pt")  # a bad one is better named by one process
         return launch(args)
     options = {"tg": args.tg, "lidar": args.lidar, "paper": args.paper}
-    meta = {**options, "tasks": args.tasks, "sequential": args.sequential,
+    meta = {**options, "tasks": args.tasks, "sequential": args.sequential, "guide": args.guide,
             "seed": args.seed, "command": "python loco_mtrl.py " + " ".join(args.argv),
             "commit": _commit()}
-    # Tasks, their difficulties, share of all steps done at the end, steps of a rollout, gamma,
-    # target_kl, largest std. Short rollouts and large steps learn fastest at first; later the noise
-    # of so few samples holds the policy back. A detour pays after many seconds: 200 steps,
-    # 1 / (1 - 0.995), are 6.7 s, and later it is 17 s. At last there is little exploration noise:
-    # who is used to much of it is not at his best without.
-    if args.sequential:  # one task after the other (section 3), each for as long
-        n = len(args.tasks)
-        stages = [([task], (0, 1), (k + 1) / n, 256, 0.995, 0.05, 1)
-                  for k, task in enumerate(args.tasks)]
-    else:
-        eyes = [task for task in args.tasks if task not in BLIND_TASKS] or args.tasks
-        stages = [(args.tasks, (0, 1), min(SHORT_UNTIL / args.steps, 0.7), 256, 0.995, 0.05, 1),
-                  (eyes, HARD, 0.8, 512, 0.998, 0.02, 1),
-                  (args.tasks, HARD, 1.0, 1024, 0.998, 0.02, 0.15)]
+    stages = plan(args)
     with contextlib.closing(LocoEnv("flat", **options)) as env:
         mirror, scan = env.mirror(), env.scan_shape
     n_tg = TrajectoryGenerator.action_size * args.tg
@@ -616,19 +693,19 @@ def train(args):
     resume, on_update = args.resume or restarted, tensorboard(run_dir) if args.tensorboard else None
     try:
         # Each stage resumes the one before.
-        for tasks, difficulty, share, num_steps, gamma, target_kl, max_std in stages:
+        for tasks, difficulty, share, settings in stages:
             # At least 20 environments, as many for each task, shared among the ranks.
             num_envs = math.ceil(len(tasks) * math.ceil(20 / len(tasks)) / ranks)
             config = PPOConfig(
-                total_timesteps=round(share * args.steps), num_envs=num_envs, num_steps=num_steps,
-                num_minibatches=min(num_steps // 50, 16), update_epochs=2, seed=args.seed,
-                checkpoint_every=10_000 // num_steps, exteroceptive=scan,
+                total_timesteps=round(share * args.steps), num_envs=num_envs, seed=args.seed,
+                num_minibatches=min(settings["num_steps"] // 50, 16), exteroceptive=scan,
+                checkpoint_every=10_000 // settings["num_steps"],
                 encoder_hidden=(128, 128), trunk_hidden=(128, 128),
                 init_std=init_std, noise_correlation=noise_correlation,
-                gamma=gamma, gae_lambda=0.98, max_advantage=1.0, learning_rate=5e-4,
-                target_kl=target_kl, max_std=float(max_std),
+                gae_lambda=0.98, max_advantage=1.0, **settings,
             )
-            make_env = functools.partial(training_env, seed=args.seed, tasks=tasks,
+            guide = {0.0: None, 1.0: "leads"}.get(config.guide_share, "speaks")
+            make_env = functools.partial(training_env, seed=args.seed, tasks=tasks, guide=guide,
                                          difficulty=difficulty, **options)
             learn(make_env, config, run_dir=run_dir, resume=resume, mirror=mirror, meta=meta,
                   episode_keys=("t_cr", "success", "fall", "exploded"), groups=args.tasks,
@@ -991,7 +1068,9 @@ def parse(argv):
     p.add_argument("--no-lidar", dest="lidar", action="store_false", help="blind policy")
     p.add_argument("--paper", action="store_true",
                    help="the paper's own state and reward: the robot knows neither its tilt nor "
-                   "where it was, and a fall costs nothing")
+                   "where it was, a fall costs nothing, and there is no guide")
+    p.add_argument("--no-guide", dest="guide", action="store_false",
+                   help="from rewards alone: no guide who knows the map shows the way in training")
     p.add_argument("--sequential", action="store_true", help="one task after the other, not mixed")
     p.add_argument("--seed", type=_whole(0), default=0)
     p.add_argument("--run-dir", default="runs/main", help="(default %(default)s)")

@@ -45,6 +45,9 @@ class PPOConfig:
     # Largest advantage, in standard deviations. A few falls and finds, many times the rest, fill
     # the gradient with noise; bounded, they still say good or bad.
     max_advantage: float = 10.0
+    # How much of what the actor learns comes from a guide (see `learn`): 0, nothing; 1, all of it,
+    # and nothing from rewards.
+    guide_share: float = 0.0
     max_grad_norm: float = 1.0  # for the actor and the critic, each on its own
     learning_rate: float = 3e-4  # the actor's first step size; it then follows target_kl ...
     min_learning_rate: float = 1e-4  # ... but never below this (too small: learning stops)
@@ -74,7 +77,7 @@ class PPOConfig:
             elif name.endswith("_hidden"):
                 good = len(value) > 0 and all(isinstance(w, int) and w >= 1 for w in value)
                 check(name, good, "a non-empty tuple of whole numbers of at least 1")
-            elif name in ("gamma", "gae_lambda", "noise_correlation"):
+            elif name in ("gamma", "gae_lambda", "noise_correlation", "guide_share"):
                 values = value if isinstance(value, tuple) else (value,)
                 check(name, values and all(0 <= v <= 1 for v in values), "in [0, 1]")
             elif isinstance(getattr(PPOConfig, name), int):
@@ -261,12 +264,13 @@ class ActorCritic(nn.Module):
         return (-0.5 * noise**2 - self.log_std() - 0.5 * math.log(2 * math.pi)).sum(-1)
 
     def evaluate(self, views, actions):
-        """Log-density of `actions` (..., act) and values, (...) each, where `views(obs)` was seen.
+        """Log-density of `actions` (..., act) and values, (...) each, then the policy's mean.
 
-        Views instead of observations: a rollout's are made once and serve all its minibatches.
+        Where `views(obs)` was seen: a rollout's are made once and serve all its minibatches.
         """
-        noise = (actions - self._mean(views)) / self.log_std().exp()
-        return self._log_density(noise), self._value(views)
+        mean = self._mean(views)
+        noise = (actions - mean) / self.log_std().exp()
+        return self._log_density(noise), self._value(views), mean
 
     @torch.no_grad()
     def act(self, obs, noise):
@@ -347,18 +351,27 @@ def ppo_loss(log_prob, old_log_prob, advantages, values, returns, clip_coef):
     return torch.stack((policy_loss, value_loss, approx_kl, (ratio != clipped).to(ratio.dtype)))
 
 
+def guide_loss(mean, guide):
+    """How far the policy's mean is from the guide's advice, (B, act) each: (B,).
+
+    Advice that is NaN counts for nothing. The distance is absolute, not squared: where a guide who
+    knows more turns left as often as right, the least squares lie in the middle, and in the wall.
+    """
+    return (mean - torch.where(guide.isnan(), mean.detach(), guide)).abs().sum(-1)
+
+
 def ppo_update(model, optimiser, batch, config, generator):
     """Several epochs of clipped gradient steps on one rollout, on all ranks together.
 
     Args:
         batch: model.views of observations (B, ...), actions (B, act), old log-densities,
-            advantages and returns (B,). B may differ from rank to rank, since each has its own
-            number of reset rows.
+            advantages and returns (B,), the guide's advice (B, act). B may differ from rank to
+            rank, since each has its own number of reset rows.
         optimiser: with two parameter groups, the actor's (whose step size it adapts), the critic's.
 
     Returns a dict of plain numbers, the same on every rank: columns of progress.csv.
     """
-    views, actions, old_log_prob, advantages, returns = batch
+    views, actions, old_log_prob, advantages, returns, guide = batch
     a, r = advantages.double(), returns.double()
     moments = sum_over_ranks(torch.stack((torch.ones_like(a), a, a**2, r, r**2)).sum(1))
     a_mean, a_square, r_mean, r_square = (moments[1:] / moments[0]).tolist()
@@ -371,29 +384,30 @@ def ppo_update(model, optimiser, batch, config, generator):
     # different numbers of rows: they add sums, and the one division by all rows comes after.
     parameters = list(model.parameters())
     sizes = [p.numel() for p in parameters]
-    flat = torch.zeros(sum(sizes) + 5)
-    for p, gradient in zip(parameters, flat.split([*sizes, 5]), strict=False):
+    flat = torch.zeros(sum(sizes) + 6)
+    for p, gradient in zip(parameters, flat.split([*sizes, 6]), strict=False):
         p.grad = gradient.view_as(p)
 
     for _epoch in range(config.update_epochs):
-        pieces = torch.zeros(4)
+        pieces = torch.zeros(5)
         # tensor_split, not split: the same number of minibatches on every rank, or they deadlock.
         shuffled = torch.randperm(len(views), generator=generator)
         for rows in shuffled.tensor_split(config.num_minibatches):
             flat.zero_()
-            log_prob, values = model.evaluate(views[rows], actions[rows])
+            log_prob, values, mean = model.evaluate(views[rows], actions[rows])
             loss = ppo_loss(log_prob, old_log_prob[rows], advantages[rows], values, returns[rows],
                             config.clip_coef).sum(1)
-            (loss[0] + loss[1]).backward()
-            flat[-5:-1] = loss.detach()
+            distance, share = guide_loss(mean, guide[rows]).sum(), config.guide_share
+            ((1 - share) * loss[0] + share * distance + loss[1]).backward()
+            flat[-6:-1] = torch.stack((*loss.detach(), distance.detach()))
             flat[-1] = len(rows)
             sum_over_ranks(flat)
             flat /= max(flat[-1].item(), 1.0)
-            pieces += flat[-5:-1] / config.num_minibatches
+            pieces += flat[-6:-1] / config.num_minibatches
             norms = [nn.utils.clip_grad_norm_(group["params"], config.max_grad_norm)
                      for group in optimiser.param_groups]
             optimiser.step()
-        _, value_loss, approx_kl, clipfrac = pieces.tolist()
+        _, value_loss, approx_kl, clipfrac, guide_distance = pieces.tolist()
         if approx_kl > 2 * config.target_kl:  # a number of all ranks, so that all of them stop
             break
 
@@ -406,7 +420,8 @@ def ppo_update(model, optimiser, batch, config, generator):
             # The critic's errors are the advantages, since returns = advantages + values.
             "explained_variance": 1 - a_var / r_var if r_var > 0 else math.nan,
             "value_loss": value_loss, "std": model.log_std().exp().mean().item(),
-            "learning_rate": actor["lr"], "grad_norm": norms[0].item()}
+            "guide_loss": guide_distance, "learning_rate": actor["lr"],
+            "grad_norm": norms[0].item()}
 
 
 def save_checkpoint(path, model, config, *, optimiser=None, counters=None, meta=None):
@@ -514,6 +529,9 @@ def learn(make_env, config, *, run_dir=None, resume=False, mirror=None, init=Non
         meta: plain dict kept in the checkpoint and in config.json.
         on_update: called on rank 0 after every update as on_update(model, row of progress.csv).
 
+    An env may put a guide's advice into every info, info["guide"] (act,): with a guide_share above
+    0 the policy's mean is drawn to what the guide would do next; NaN where he has no advice.
+
     Every checkpoint_every updates all envs are reset and the random numbers start afresh from
     (seed, update, rank). So a checkpoint made there holds everything, and going on from it gives
     the same bits as never having stopped (with as many ranks, and envs that reset(seed) defines).
@@ -589,11 +607,15 @@ def learn(make_env, config, *, run_dir=None, resume=False, mirror=None, init=Non
     update, steps, minutes_before = 0, 0, 0.0
     if checkpoint:
         optimiser.load_state_dict(checkpoint["optimiser"])
+        actor_group = optimiser.param_groups[0]  # the settings may have changed since
+        actor_group["lr"] = min(max(actor_group["lr"], config.min_learning_rate),
+                                config.max_learning_rate)
         update, steps, minutes_before = checkpoint["counters"].values()
     model.limit_std(config.max_std)
 
     obs = torch.zeros(num_steps + 1, num_envs, dims["obs_dim"])
     actions = torch.zeros(num_steps, num_envs, dims["act_dim"])
+    guide = torch.full_like(actions, math.nan)
     rewards, log_prob = torch.zeros(2, num_steps, num_envs)
     terminated, done, prev_done = torch.zeros(3, num_steps, num_envs, dtype=torch.bool)
     generator = torch.Generator()
@@ -617,13 +639,15 @@ def learn(make_env, config, *, run_dir=None, resume=False, mirror=None, init=Non
                 seeds = np.random.SeedSequence((config.seed, update, rank))
                 torch_seed, *env_seeds = seeds.generate_state(num_envs + 1, np.uint64).tolist()
                 generator.manual_seed(torch_seed)
-                next_obs, _ = envs.reset(seed=env_seeds)
+                next_obs, info = envs.reset(seed=env_seeds)
                 noise = torch.randn(num_envs, dims["act_dim"], generator=generator)
                 ended, returned, fresh = np.zeros(num_envs, bool), np.zeros(num_envs), False
 
             for t in range(num_steps):
                 obs[t] = torch.from_numpy(next_obs).flatten(1)
                 prev_done[t] = torch.from_numpy(ended)
+                if "guide" in info:
+                    guide[t] = torch.from_numpy(np.stack(info["guide"]))
                 # Each action by itself is still drawn from the policy, so the loss stays the same.
                 fresh_noise = torch.randn(noise.shape, generator=generator)
                 noise = kept * noise + (1 - kept**2).sqrt() * fresh_noise
@@ -649,7 +673,7 @@ def learn(make_env, config, *, run_dir=None, resume=False, mirror=None, init=Non
                 views = model.views(seen)
             advantages, returns = compute_gae(rewards, values, terminated, done, prev_done,
                                               config.gamma, config.gae_lambda)
-            batch = [x[~prev_done] for x in (actions, log_prob, advantages, returns)]
+            batch = [x[~prev_done] for x in (actions, log_prob, advantages, returns, guide)]
             stats = ppo_update(model, optimiser, [views, *batch], config, generator)
             model.limit_std(config.max_std)
             # Only now: while learning, the old and the new policy must see the same scale.

@@ -14,7 +14,16 @@ from hypothesis.extra.numpy import arrays
 
 import loco_mtrl
 import terrain
-from loco_mtrl import DT, GOAL_RADIUS, LIDAR_FRONT, LIDAR_RANGE, N_RAYS, LocoEnv, training_env
+from loco_mtrl import (
+    DT,
+    GOAL_RADIUS,
+    LIDAR_FRONT,
+    LIDAR_RANGE,
+    N_RAYS,
+    Guide,
+    LocoEnv,
+    training_env,
+)
 
 SHAPE = (60, 40)
 N_SCAN = N_RAYS + len(loco_mtrl.MEMORY_POINTS)
@@ -242,33 +251,74 @@ def test_reward_is_velocity_toward_the_goal_and_sums_to_the_progress(paper):
     env = LocoEnv("rugged", difficulty=0.35, paper=paper)
     env.reset(seed=1)
 
-    def to_go():
-        x, y, _ = np.subtract(env.position, env.origin)
-        return env.distance if paper else env.terrain.to_go(env.route, x, y)
-
-    first, distance, total = to_go(), env.distance, 0.0
+    first, total = env.distance, 0.0
     for _ in range(120):
-        before = to_go()
+        before = env.distance
         _, reward, terminated, _, info = env.step(np.zeros(17))
-        assert reward == pytest.approx((before - to_go()) / DT)
+        assert reward == pytest.approx((before - env.distance) / DT)
         total += reward * DT
         assert not terminated
-    assert total == pytest.approx(first - to_go())
+    assert total == pytest.approx(first - env.distance)
     assert total > 0.5  # the zero action has walked toward the goal, and that is positive
-    assert info["t_cr"] == pytest.approx(1 - env.distance / distance)
+    assert info["t_cr"] == pytest.approx(1 - env.distance / first)
     env.close()
 
 
-def test_the_shortest_way_leads_around_a_wall():
-    """The way to an opening and on, by hand; 8-connected ways are up to 8 % longer."""
-    with closing(LocoEnv(wall_ahead)) as env:
-        env.reset(seed=0, options={"route": 0})
-        terrain_, goal = env.terrain, env.terrain.goals[0]
-    x, y, *_ = terrain_.starts[0]
-    assert (x < 6) != (goal[0] < 6)  # the wall is between them, its opening at y > 2.4
-    around = np.hypot(x - 6.2, y - 2.8) + np.hypot(goal[0] - 6.2, goal[1] - 2.8)
-    assert around * 0.97 - 0.3 < terrain_.to_go(0, x, y) < around * 1.09 + 0.4
-    assert terrain_.to_go(0, *goal[:2]) < 0.15
+def test_the_guide_leads_around_a_wall():
+    """Straight on would end at the wall; the legs of the guide's gait alone reach the goal."""
+    with closing(Guide(LocoEnv(wall_ahead))) as env:
+        _, info = env.reset(seed=0, options={"route": 0})
+        goal, terminated = env.unwrapped.terrain.goals[0], False
+        assert (env.unwrapped.position[0] < 6) != (goal[0] < 6)  # the wall is between them
+        while not terminated and env.unwrapped.time < 30:
+            assert np.isnan(info["guide"][[0, *range(3, 17)]]).all()
+            assert np.abs(info["guide"][1:3]).max() <= 0.95
+            _, _, terminated, _, info = env.step(np.nan_to_num(info["guide"]))
+        assert info["success"]
+
+
+@pytest.mark.parametrize(("yaw", "turns"), [(0.0, 0), (1.2, -1), (-1.2, 1), (2.8, -1)])
+def test_the_guide_turns_to_the_goal(yaw, turns):
+    """On open ground, the goal ahead, to the right, to the left, behind on the right."""
+    with closing(Guide(LocoEnv("flat"))) as env:
+        env.reset(seed=0)
+        x, y, _ = np.subtract(env.unwrapped.position, env.unwrapped.origin)
+        goal = env.unwrapped.terrain.goals[env.unwrapped.route]
+        place(env.unwrapped, x, y, 0.35, yaw=math.atan2(goal[1] - y, goal[0] - x) + yaw)
+        *_, info = env.step(np.zeros(17))
+        left, right = 0.13 + 0.27 * info["guide"][1:3]  # m
+        if turns:
+            assert np.sign(right - left) == turns and abs(right - left) > 0.3
+        else:
+            assert abs(right - left) < 0.05
+        assert (left + right) / 2 == pytest.approx(0.21 * max(0, math.cos(yaw)) ** 2, abs=0.05)
+
+
+@pytest.mark.parametrize("leads", [True, False])
+def test_a_guide_who_leads_takes_the_robot_on_when_it_stays(leads):
+    """A robot that treads on the spot: after 5 s it is led, half a metre, and is left again."""
+    with closing(Guide(LocoEnv("flat"), leads)) as env:
+        _, info = env.reset(seed=0)
+        robot, led, still = env.unwrapped, [], np.zeros(17)
+        still[1:3] = -0.13 / 0.27  # strides of 0 m
+        while robot.time < 12:
+            *_, info = env.step(still)
+            led.append(env.leads)
+    assert not any(led[: round(4.9 / DT)]) and any(led) == leads
+    assert info["t_cr"] < 0.1  # what it has done alone
+    progress = robot.start_distance - robot.distance
+    assert progress > 0.5 if leads else abs(progress) < 0.3
+    if leads:
+        assert not led[-1] or led.index(True) < led.index(False, led.index(True))
+        assert sum(led) * DT < 6
+
+
+def test_the_guide_is_silent_when_the_simulation_breaks_down():
+    with closing(Guide(LocoEnv("flat"))) as env:
+        env.reset(seed=0)
+        env.unwrapped.bullet.resetBaseVelocity(env.unwrapped.robot, (0, 0, 0), (np.nan, 0, 0))
+        _, _, terminated, _, info = env.step(np.zeros(17))
+        assert terminated and info["exploded"] and np.isnan(info["guide"]).all()
 
 
 def test_zero_action_walks_by_itself(plane):
@@ -296,11 +346,11 @@ def test_success_ends_the_episode_at_the_goal(flat):
 def test_tipping_over_is_a_fall_and_costs_two_metres(paper, cost):
     with closing(LocoEnv("flat", paper=paper)) as env:
         env.reset(seed=0)
-        before = env.to_go
+        before = env.distance
         place(env, *np.subtract(env.position, env.origin)[:2], 0.6, roll=1.4)
         _, reward, terminated, _, info = env.step(np.zeros(17))
         assert terminated and info["fall"] and not info["success"]
-        assert reward * DT == pytest.approx(before - env.to_go - cost, abs=1e-6)
+        assert reward * DT == pytest.approx(before - env.distance - cost, abs=1e-6)
 
 
 def test_dropping_off_an_edge_is_a_fall():

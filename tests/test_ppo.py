@@ -162,7 +162,11 @@ def rollout(model, rows=64):
     noise = torch.randn(rows, model.kwargs["act_dim"], generator=generator)
     actions, log_prob = model.act(obs, noise)
     advantages, returns = torch.randn(2, rows, generator=generator)
-    return [model.views(obs), actions, log_prob, advantages, returns]
+    return [model.views(obs), actions, log_prob, advantages, returns, no_advice(actions)]
+
+
+def no_advice(actions):
+    return torch.full_like(actions, math.nan)
 
 
 def optimiser_of(model):
@@ -207,7 +211,8 @@ def test_log_prob_is_that_of_torch():
     torch.nn.init.normal_(model.free_log_std)
     obs, actions = torch.randn(6, 5, 4), torch.randn(6, 5, 3)
     normal = torch.distributions.Normal(model.mean(obs), model.log_std().exp())
-    log_prob, values = model.evaluate(model.views(obs), actions)
+    log_prob, values, mean = model.evaluate(model.views(obs), actions)
+    assert torch.equal(mean, model.mean(obs))
     torch.testing.assert_close(log_prob, normal.log_prob(actions).sum(-1))
     torch.testing.assert_close(values, model.value(obs))
     acted, log_prob = model.act(obs, noise := torch.randn(6, 5, 3))
@@ -402,7 +407,7 @@ def test_the_noise_never_exceeds_its_bound():
 
 def test_advantages_are_bounded(monkeypatch):
     model = ActorCritic(2, 1)
-    views, actions, log_prob, _, returns = rollout(model, 4)
+    views, actions, log_prob, _, returns, guide = rollout(model, 4)
     advantages = torch.tensor([0.0, 0.0, 0.0, 8.0])  # mean 2, std sqrt(12)
     for bound, valid in ((10.0, [-0.577350, 1.732051]), (1.0, [-0.577350, 1.0])):
         seen = set()
@@ -413,8 +418,8 @@ def test_advantages_are_bounded(monkeypatch):
 
         monkeypatch.setattr(ppo, "ppo_loss", spy)
         config = PPOConfig(max_advantage=bound, num_minibatches=1, num_envs=1, num_steps=4)
-        ppo_update(model, optimiser_of(model), [views, actions, log_prob, advantages, returns],
-                   config, torch.Generator())
+        batch = [views, actions, log_prob, advantages, returns, guide]
+        ppo_update(model, optimiser_of(model), batch, config, torch.Generator())
         assert sorted(seen) == pytest.approx(valid, abs=1e-5)
 
 
@@ -540,7 +545,8 @@ def test_run_folder(tmp_path):
     row = table(tmp_path)[-1]
     assert {"update", "steps", "minutes", "steps_per_s", "collect_s", "learn_s", "return", "t_cr",
             "success", "fall", "t_cr/left", "t_cr/right", "approx_kl", "clipfrac", "value_loss",
-            "explained_variance", "std", "learning_rate", "grad_norm"} == set(row)
+            "explained_variance", "std", "guide_loss", "learning_rate",
+            "grad_norm"} == set(row)
     # 8 of 20 steps more than a rollout: two rollouts of 32 end 3 episodes (21 rows each) per env.
     assert int(row["steps"]) == 2 * 4 * 32 - 3 * 4
     assert row["success"] == "nan" and abs(float(row["t_cr"]) - 0.5) <= 1 / 8
@@ -635,6 +641,55 @@ def test_bad_checkpoints_are_refused(tmp_path):
     torch.save({"weights": torch.zeros(2)}, path)
     with pytest.raises(ValueError, match=r"bad\.pt is not a checkpoint"):
         ppo.load_checkpoint(path)
+
+
+# --- the guide
+
+
+def test_guide_loss_by_hand():
+    mean = torch.tensor([[0.5, -0.5, 0.1], [0.0, 0.2, 0.3]], requires_grad=True)
+    advice = torch.tensor([[0.1, 0.5, math.nan], [math.nan, math.nan, math.nan]])
+    loss = ppo.guide_loss(mean, advice)
+    assert loss.tolist() == pytest.approx([1.4, 0.0])
+    loss.sum().backward()  # where there is no advice nothing pulls, and NaN does not spread
+    assert mean.grad.tolist() == [[1, -1, 0], [0, 0, 0]]
+
+
+def test_where_a_guide_turns_both_ways_the_policy_picks_the_more_frequent():
+    """Of 0.8, 0.8 and -0.8 the mean is 0.27, which nobody advised; the median is 0.8."""
+    mean = torch.zeros(3, 1, requires_grad=True)
+    for _ in range(100):
+        ppo.guide_loss(mean[:1].expand(3, 1), torch.tensor([[0.8], [0.8], [-0.8]])).sum().backward()
+        with torch.no_grad():
+            mean -= 0.01 * mean.grad
+        mean.grad = None
+    assert mean[0].item() == pytest.approx(0.8, abs=0.02)
+
+
+class Guided(Probe):
+    """Rewards are for nothing; the guide says what to do, but for every second episode."""
+
+    def told(self, info):
+        return info | {"guide": np.array([0.5 * self.obs[0] if self.obs[1] > 0 else np.nan])}
+
+    def reset(self, **kwargs):
+        obs, info = super().reset(**kwargs)
+        return obs, self.told(info)
+
+    def step(self, action):
+        *rest, info = super().step(action)
+        return *rest, self.told(info)
+
+
+@pytest.mark.parametrize("share", [1.0, 0.5])
+def test_the_policy_learns_what_its_guide_does(share):
+    config = PPOConfig(total_timesteps=6000, guide_share=share, target_kl=1.0, **SMALL)
+    rows = []
+    model = learn(lambda index: Guided(lambda *_: 0.0, length=3), config, episode_keys=(),
+                  on_update=lambda _, row: rows.append(row))
+    obs = np.array([[1.0, 1.0], [-1.0, 1.0]], np.float32)
+    assert model.mean_action(obs)[:, 0] == pytest.approx([0.5, -0.5], abs=0.1)
+    assert rows[-1]["guide_loss"] < 0.3 * rows[0]["guide_loss"]
 
 
 # --- two ranks
