@@ -554,6 +554,24 @@ PACE = 0.21  # m, the guide's stride where its way is straight
 PATIENCE = 5.0  # s without getting on, after which he takes the robot by the hand
 
 
+def advise(env):
+    """The action of one who knows the map, NaN for all but the two strides: (n_act,)."""
+    advice = np.full(env.action.shape, np.nan)
+    if env.exploded:
+        return advice
+    x, y, _ = np.subtract(env.position, env.origin).tolist()
+    to_x, to_y, _ = np.subtract(env.goal, env.origin).tolist()
+    if env.distance > 0.7:
+        to_x, to_y = env.terrain.ahead(env.route, x, y)
+    turn = math.remainder(math.atan2(to_y - y, to_x - x) - env.yaw, 2 * math.pi)
+    # The strides: slower in a bend, on the spot where the way lies to the side or behind.
+    forward = PACE * max(0.0, math.cos(turn)) ** 2
+    aside = 0.2 * min(max(1.2 * turn, -1.0), 1.0)
+    strides = np.array([forward - aside, forward + aside])
+    advice[1:3] = np.clip((strides - CENTRE[1:3]) / RANGE[1:3], -0.95, 0.95)
+    return advice
+
+
 class Guide(gymnasium.Wrapper):
     """Tells a robot in training the way: info["guide"] is what one who knows the map would do.
 
@@ -562,8 +580,8 @@ class Guide(gymnasium.Wrapper):
     he would go. (n_act,), NaN for all but the two strides: the rest it finds out for itself.
 
     If he `leads`, he takes a robot that has not got on for PATIENCE by the hand, until it is
-    half a metre nearer than it has ever been: one that is stuck has little to teach. What info
-    says of the episode then remains what it was when it last walked alone.
+    half a metre nearer than it has ever been: one that is stuck has little to teach. Its t_cr and
+    success in info then remain what they were when it last walked alone.
     """
 
     def __init__(self, env, leads=False):
@@ -583,7 +601,7 @@ class Guide(gymnasium.Wrapper):
 
     def _guided(self, info):
         env = self.unwrapped
-        self.advice = self._advise(env)
+        self.advice = advise(env)
         if env.exploded:
             return info | {"guide": self.advice}
         x, y, _ = np.subtract(env.position, env.origin).tolist()
@@ -595,22 +613,6 @@ class Guide(gymnasium.Wrapper):
             # What the robot would have reached alone, once and for all.
             self.verdict = self.verdict or {"t_cr": info["t_cr"], "success": False}
         return info | self.verdict | {"guide": self.advice}
-
-    def _advise(self, env):
-        advice = np.full(env.action.shape, np.nan)
-        if env.exploded:
-            return advice
-        x, y, _ = np.subtract(env.position, env.origin).tolist()
-        to_x, to_y, _ = np.subtract(env.goal, env.origin).tolist()
-        if env.distance > 0.7:
-            to_x, to_y = env.terrain.ahead(env.route, x, y)
-        turn = math.remainder(math.atan2(to_y - y, to_x - x) - env.yaw, 2 * math.pi)
-        # The strides: slower in a bend, on the spot where the way lies to the side or behind.
-        forward = PACE * max(0.0, math.cos(turn)) ** 2
-        aside = 0.2 * min(max(1.2 * turn, -1.0), 1.0)
-        strides = np.array([forward - aside, forward + aside])
-        advice[1:3] = np.clip((strides - CENTRE[1:3]) / RANGE[1:3], -0.95, 0.95)
-        return advice
 
 
 # ------------------------------------------------------------------------------- train
@@ -815,7 +817,12 @@ def walk_straight(observation, env):
     return action
 
 
-REFERENCES = {"zero": zero_action, "straight": walk_straight}
+def follow_guide(observation, env):
+    """What a robot could reach that knew the map: the guide's strides on the same generator."""
+    return np.nan_to_num(advise(env.unwrapped))
+
+
+REFERENCES = {"zero": zero_action, "straight": walk_straight, "guide": follow_guide}
 
 
 def load_actor(name):

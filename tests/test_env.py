@@ -277,6 +277,24 @@ def test_the_guide_leads_around_a_wall():
         assert info["success"]
 
 
+@pytest.mark.parametrize("world", ["maze", "cliff"])
+def test_the_guide_reaches_the_goal_of_a_world(world):
+    _, (result,) = loco_mtrl.episodes((world, 3, ["guide"]))
+    assert result["success"] and result["seconds"] < 40
+
+
+@pytest.mark.parametrize(("arguments", "shares"), [
+    ([], [1.0, 1.0, 0.5]), (["--no-guide"], [0.0] * 3), (["--paper"], [0.0] * 3),
+    (["--no-tg"], [0.0] * 3), (["--no-lidar"], [1.0, 1.0, 0.5]),
+    (["--sequential", "--tasks", "flat,walls"], [1.0, 1.0]),
+])
+def test_who_learns_from_the_guide(arguments, shares):
+    """Strides are all he can teach; the paper knows no guide."""
+    stages = loco_mtrl.plan(loco_mtrl.parse(["train", *arguments]))
+    assert [settings.get("guide_share", 0.0) for *_, settings in stages] == shares
+    assert stages[-1][2] == 1.0
+
+
 @pytest.mark.parametrize(("yaw", "turns"), [(0.0, 0), (1.2, -1), (-1.2, 1), (2.8, -1)])
 def test_the_guide_turns_to_the_goal(yaw, turns):
     """On open ground, the goal ahead, to the right, to the left, behind on the right."""
