@@ -395,10 +395,15 @@ def ppo_update(model, optimiser, batch, config, generator):
         for rows in shuffled.tensor_split(config.num_minibatches):
             flat.zero_()
             log_prob, values, mean = model.evaluate(views[rows], actions[rows])
+            if config.guide_share == 1:  # ratios may overflow then, and 0 times infinity is not 0
+                log_prob = log_prob.detach()
             loss = ppo_loss(log_prob, old_log_prob[rows], advantages[rows], values, returns[rows],
                             config.clip_coef).sum(1)
-            distance, share = guide_loss(mean, guide[rows]).sum(), config.guide_share
-            ((1 - share) * loss[0] + share * distance + loss[1]).backward()
+            distance = guide_loss(mean, guide[rows]).sum()
+            objective = config.guide_share * distance + loss[1]
+            if config.guide_share < 1:
+                objective = objective + (1 - config.guide_share) * loss[0]
+            objective.backward()
             flat[-6:-1] = torch.stack((*loss.detach(), distance.detach()))
             flat[-1] = len(rows)
             sum_over_ranks(flat)

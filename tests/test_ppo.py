@@ -538,6 +538,17 @@ def test_stopping_and_resuming_changes_no_bit(tmp_path):
     assert float(last["minutes"]) > stopped["minutes"] > 0
 
 
+def test_a_resumed_run_keeps_to_its_new_bounds_of_the_step_size(tmp_path):
+    env, rows = partial(Probe, length=3), []
+    config = PPOConfig(total_timesteps=300, learning_rate=1e-3, **SMALL)
+    learn(lambda index: env(), config, run_dir=tmp_path)
+    config = PPOConfig(total_timesteps=600, learning_rate=1e-5, min_learning_rate=1e-6,
+                       max_learning_rate=1e-5, **SMALL)
+    learn(lambda index: env(), config, run_dir=tmp_path, resume=True,
+          on_update=lambda _, row: rows.append(row["learning_rate"]))
+    assert rows and max(rows) <= 1e-5
+
+
 def test_run_folder(tmp_path):
     model = run(tmp_path, 2, meta={"command": "train", "commit": "abc"})
     names = {path.name for path in tmp_path.iterdir()}
@@ -664,6 +675,19 @@ def test_where_a_guide_turns_both_ways_the_policy_picks_the_more_frequent():
             mean -= 0.01 * mean.grad
         mean.grad = None
     assert mean[0].item() == pytest.approx(0.8, abs=0.02)
+
+
+def test_a_guide_alone_may_lead_as_far_as_he_likes():
+    """A ratio that overflows is no concern of his: nothing of it reaches the parameters."""
+    torch.manual_seed(0)
+    model = ActorCritic(5, 2)
+    views, actions, log_prob, *rest, guide = rollout(model)
+    batch = [views, actions, log_prob - 1000, *rest, torch.full_like(guide, 0.5)]
+    config = PPOConfig(guide_share=1.0, target_kl=1e9, learning_rate=1e-3)
+    stats = [ppo_update(model, optimiser_of(model), batch, config, torch.Generator())
+             for _ in range(20)]
+    assert stats[-1]["guide_loss"] < stats[0]["guide_loss"]
+    assert all(torch.isfinite(p).all() for p in model.parameters())
 
 
 class Guided(Probe):
