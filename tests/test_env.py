@@ -364,8 +364,8 @@ def test_success_ends_the_episode_at_the_goal(flat):
 def test_tipping_over_is_a_fall_and_costs_two_metres(paper, cost):
     with closing(LocoEnv("flat", paper=paper)) as env:
         env.reset(seed=0)
-        before = env.distance
         place(env, *np.subtract(env.position, env.origin)[:2], 0.6, roll=1.4)
+        before = env.distance
         _, reward, terminated, _, info = env.step(np.zeros(17))
         assert terminated and info["fall"] and not info["success"]
         assert reward * DT == pytest.approx(before - env.distance - cost, abs=1e-6)
