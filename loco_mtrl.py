@@ -586,15 +586,15 @@ class Guide(gymnasium.Wrapper):
 
     def __init__(self, env, leads=False):
         super().__init__(env)
-        self.may_lead = leads
+        self.leads = leads
 
     def reset(self, **kwargs):
         observation, info = self.env.reset(**kwargs)
-        self.nearest, self.since, self.leads, self.verdict = math.inf, 0.0, False, {}
+        self.nearest, self.since, self.leading, self.verdict = math.inf, 0.0, False, {}
         return observation, self._guided(info)
 
     def step(self, action):
-        if self.leads:
+        if self.leading:
             action = np.where(np.isnan(self.advice), action, self.advice)
         *rest, info = self.env.step(action)
         return *rest, self._guided(info)
@@ -602,16 +602,15 @@ class Guide(gymnasium.Wrapper):
     def _guided(self, info):
         env = self.unwrapped
         self.advice = advise(env)
-        if env.exploded:
-            return info | {"guide": self.advice}
-        x, y, _ = np.subtract(env.position, env.origin).tolist()
-        to_go = env.terrain.to_go(env.route, x, y)[0]
-        if to_go < self.nearest - 0.5:
-            self.nearest, self.since, self.leads = to_go, env.time, False
-        elif self.may_lead and env.time > self.since + PATIENCE and not self.leads:
-            self.leads = True
-            # What the robot would have reached alone, once and for all.
-            self.verdict = self.verdict or {"t_cr": info["t_cr"], "success": False}
+        if self.leads and not env.exploded:
+            x, y, _ = np.subtract(env.position, env.origin).tolist()
+            to_go, *_ = env.terrain.to_go(env.route, x, y)
+            if to_go < self.nearest - 0.5:
+                self.nearest, self.since, self.leading = to_go, env.time, False
+            elif env.time > self.since + PATIENCE and not self.leading:
+                self.leading = True
+                # What the robot would have reached alone, once and for all.
+                self.verdict = self.verdict or {"t_cr": info["t_cr"], "success": False}
         return info | self.verdict | {"guide": self.advice}
 
 
@@ -627,16 +626,16 @@ BLIND_TASKS = ("rugged", "holes", "stones", "pyramids_up", "pyramids_down", "gap
                "blocks", "waves")
 
 
-def training_env(index, seed, tasks, guide=None, **options):
+def training_env(index, seed, tasks, guide_share=0.0, **options):
     """Environment number `index` over all ranks: one of the tasks, on terrains of its own.
 
     So all tasks have the same share of every batch. An env that drew its tasks would spend its
-    time where the robot is stuck until time is up, little where it soon falls. guide: None, or
-    that he "speaks" or "leads", see Guide.
+    time where the robot is stuck until time is up, little where it soon falls. A guide leads only
+    where there is nothing but him to learn from: PPO needs actions that are the policy's own.
     """
     env = gymnasium.make("LocoMTRL-v0", disable_env_checker=True, pool_seed=(seed, index),
                          tasks=tasks[index % len(tasks)], terrains=len(tasks), **options)
-    env = Guide(env, guide == "leads") if guide else env
+    env = Guide(env, leads=guide_share == 1) if guide_share else env
     return gymnasium.wrappers.TransformReward(env, lambda reward: REWARD_SCALE * reward)
 
 
@@ -656,6 +655,7 @@ def plan(args):
     last = middle | dict(num_steps=1024, max_std=0.15)
     start = min(SHORT_UNTIL / args.steps, 0.7)
     if args.guide and args.tg and not args.paper:
+        # Advice has no noise that a trust region would have to guard against.
         follow = dict(guide_share=1.0, update_epochs=3, target_kl=1e9)
         first |= follow | dict(max_std=0.2) | _constant(1e-3)
         middle |= follow | dict(max_std=0.15) | _constant(5e-4)
@@ -669,6 +669,7 @@ def plan(args):
 
 
 def _constant(step):
+    """Settings for one step size all the time, whatever the KL."""
     return dict(learning_rate=step, min_learning_rate=step, max_learning_rate=step)
 
 
@@ -706,9 +707,9 @@ def train(args):
                 init_std=init_std, noise_correlation=noise_correlation,
                 gae_lambda=0.98, max_advantage=1.0, **settings,
             )
-            guide = {0.0: None, 1.0: "leads"}.get(config.guide_share, "speaks")
-            make_env = functools.partial(training_env, seed=args.seed, tasks=tasks, guide=guide,
-                                         difficulty=difficulty, **options)
+            make_env = functools.partial(training_env, seed=args.seed, tasks=tasks,
+                                         guide_share=config.guide_share, difficulty=difficulty,
+                                         **options)
             learn(make_env, config, run_dir=run_dir, resume=resume, mirror=mirror, meta=meta,
                   episode_keys=("t_cr", "success", "fall", "exploded"), groups=args.tasks,
                   on_update=on_update)

@@ -321,7 +321,7 @@ def test_a_guide_who_leads_takes_the_robot_on_when_it_stays(leads):
         still[1:3] = -0.13 / 0.27  # strides of 0 m
         while robot.time < 12:
             *_, info = env.step(still)
-            led.append(env.leads)
+            led.append(env.leading)
     assert not any(led[: round(4.9 / DT)]) and any(led) == leads
     assert info["t_cr"] < 0.1  # what it has done alone
     progress = robot.start_distance - robot.distance
