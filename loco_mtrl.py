@@ -486,11 +486,17 @@ class LocoEnv(gymnasium.Env):
             self.trail.append((x, y))
         size = math.hypot(r[0], r[3])
         forward, left = (r[0] / size, r[3] / size), (-r[3] / size, r[0] / size)
-        px, py = (MEMORY_POINTS @ (forward, left) + (x, y)).T[..., None]
-        xs, ys = np.array(self.trail[-MEMORY:]).T
-        dx, dy = px - xs, py - ys  # (points, places) each
-        seconds = np.maximum(1 - dx * dx - dy * dy, 0).sum(1)
+        seconds = self.time_around(*(MEMORY_POINTS @ (forward, left) + (x, y)).T)
         return np.log1p(seconds) / math.log1p(MEMORY)
+
+    def time_around(self, x, y):
+        """Seconds of the last MEMORY spent within a metre of x, y (m, arrays), the nearer the more.
+
+        x, y are in Bullet's frame, as `position` is.
+        """
+        xs, ys = np.array(self.trail[-MEMORY:]).T
+        dx, dy = x[..., None] - xs, y[..., None] - ys  # (..., places) each
+        return np.maximum(1 - dx * dx - dy * dy, 0).sum(-1)
 
     def render(self):
         """The robot from above and behind, as uint8 (300, 400, 3)."""
@@ -550,20 +556,31 @@ if "LocoMTRL-v0" not in gymnasium.registry:  # run as a script, this file is imp
 
 # ------------------------------------------------------------------------------- the guide
 
-PACE = 0.21  # m, the guide's stride where its way is straight
-PATIENCE = 5.0  # s without getting on, after which he takes the robot by the hand
+PACE = 0.21  # m, the guide's stride where his way is straight
+PATIENCE = 5  # s without getting on, after which he takes the robot by the hand
+# Where he looks: along lines all around (rad, from straight ahead), as far as the LiDAR does (m).
+_LINES, _ALONG = np.radians(np.arange(-180, 180, 10)), np.arange(0.3, 4.6, 0.3)[:, None]
 
 
 def advise(env):
-    """The action of one who knows the map, NaN for all but the two strides: (n_act,)."""
+    """What a guide would do who sees what the robot could see, but knows it for what it is.
+
+    Of all places in sight he turns to the one with the least sum of: the distance left from there
+    to the goal; the effort of the straight way there (`Terrain.cost`); two metres for each second
+    that the robot has lately spent around it, which drives him out of dead ends; and a metre for a
+    turn about. Returns an action, NaN for all but the two strides: (n_act,).
+    """
     advice = np.full(env.action.shape, np.nan)
     if env.exploded:
         return advice
-    x, y, _ = np.subtract(env.position, env.origin).tolist()
-    to_x, to_y, _ = np.subtract(env.goal, env.origin).tolist()
-    if env.distance > 0.7:
-        to_x, to_y = env.terrain.ahead(env.route, x, y)
+    (x, y, _), (to_x, to_y, _) = np.subtract((env.position, env.goal), env.origin)
     turn = math.remainder(math.atan2(to_y - y, to_x - x) - env.yaw, 2 * math.pi)
+    if env.distance > 0.7:
+        px, py = x + _ALONG * np.cos(env.yaw + _LINES), y + _ALONG * np.sin(env.yaw + _LINES)
+        effort = 0.12 * env.terrain.effort(px, py).cumsum(0)  # 0.3 m a step, 0.4 for each metre
+        total = np.hypot(px - to_x, py - to_y) + effort + np.abs(_LINES) / np.pi
+        total += 2 * env.time_around(px + env.origin[0], py)
+        turn = _LINES[total.min(0).argmin()]
     # The strides: slower in a bend, on the spot where the way lies to the side or behind.
     forward = PACE * max(0.0, math.cos(turn)) ** 2
     aside = 0.2 * min(max(1.2 * turn, -1.0), 1.0)
@@ -573,15 +590,15 @@ def advise(env):
 
 
 class Guide(gymnasium.Wrapper):
-    """Tells a robot in training the way: info["guide"] is what one who knows the map would do.
+    """Tells a robot in training the way: info["guide"] is what `advise` says.
 
-    He walks the trajectory generator along `Terrain.ways`, and turns where they turn. He is no part
-    of the policy, only of what it learns from: to recognise, in what its own senses tell, which way
-    he would go. (n_act,), NaN for all but the two strides: the rest it finds out for itself.
+    He is no part of the policy, only of what it learns from: to recognise, in what its own senses
+    tell, which way he would go. (n_act,), NaN for all but the two strides: the rest it finds out
+    for itself.
 
-    If he `leads`, he takes a robot that has not got on for PATIENCE by the hand, until it is
-    half a metre nearer than it has ever been: one that is stuck has little to teach. Its t_cr and
-    success in info then remain what they were when it last walked alone.
+    If he `leads`, he takes a robot that stays within half a metre for PATIENCE by the hand, until
+    it has come 1.5 m in that time: one that is stuck has little to teach. Its t_cr and success in
+    info then remain what they were when it last walked alone.
     """
 
     def __init__(self, env, leads=False):
@@ -590,7 +607,7 @@ class Guide(gymnasium.Wrapper):
 
     def reset(self, **kwargs):
         observation, info = self.env.reset(**kwargs)
-        self.nearest, self.since, self.leading, self.verdict = math.inf, 0.0, False, {}
+        self.leading, self.verdict = False, {}
         return observation, self._guided(info)
 
     def step(self, action):
@@ -602,15 +619,11 @@ class Guide(gymnasium.Wrapper):
     def _guided(self, info):
         env = self.unwrapped
         self.advice = advise(env)
-        if self.leads and not env.exploded:
-            x, y, _ = np.subtract(env.position, env.origin).tolist()
-            to_go, *_ = env.terrain.to_go(env.route, x, y)
-            if to_go < self.nearest - 0.5:
-                self.nearest, self.since, self.leading = to_go, env.time, False
-            elif env.time > self.since + PATIENCE and not self.leading:
-                self.leading = True
-                # What the robot would have reached alone, once and for all.
-                self.verdict = self.verdict or {"t_cr": info["t_cr"], "success": False}
+        if self.leads and not env.exploded and len(env.trail) > PATIENCE:
+            moved = math.dist(env.position[:2], env.trail[-1 - PATIENCE])
+            self.leading = moved < (1.5 if self.leading else 0.5)
+            if self.leading and not self.verdict:  # what the robot has reached alone
+                self.verdict = {"t_cr": info["t_cr"], "success": False}
         return info | self.verdict | {"guide": self.advice}
 
 

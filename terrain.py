@@ -8,7 +8,6 @@ Frame: x runs along the m pillars from 0, y along the n pillars with 0 in the mi
 lengths are in metres and all angles in radians unless a name says otherwise.
 """
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
@@ -20,8 +19,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 L = W = 0.2  # m, cross-section of a training pillar
 SHAPE = (60, 40)  # m x n pillars: 12 m x 8 m
 
-WAY_CELL = 0.2  # m, grid on which the best ways are known
-CELL = WAY_CELL / 2  # m, navigation grid; a disc of 0.25 m radius is known on it to half a cell
+CELL = 0.1  # m, navigation grid; a disc of 0.25 m radius is known on it to half a cell
 CLIMB = 0.12  # m, highest step that Laikago's feet clear with room to spare
 STEP = 0.2  # m, highest step that they clear at all: what training may ask for
 FLAT = 0.05  # m, most that the ground under a start may vary
@@ -106,28 +104,14 @@ class Terrain:
     triangles: np.ndarray  # (F, 3) int, counter-clockwise seen from outside
     starts: np.ndarray  # (K, 4) x, y, ground z, yaw
     goals: np.ndarray  # (K, 3) x, y, ground z
-    ways: np.ndarray  # (K, nx, ny) effort of the best way to goal k from each cell of WAY_CELL
+    cost: np.ndarray  # (nx, ny) effort of a metre in each CELL: 1 on open ground, 50 in a wall
     height: Callable  # height(x, y) -> ground z, arrays or scalars; -inf outside
     people: tuple[Person, ...] = ()
 
-    def to_go(self, route, x, y):
-        """`ways` to goal `route` at x, y (m, scalars), interpolated, and its two derivatives."""
-        ways = self.ways[route]
-        u, v = x / WAY_CELL - 0.5, y / WAY_CELL + ways.shape[1] / 2 - 0.5
-        u, v = (min(max(a, 0.0), n - 1.001) for a, n in zip((u, v), ways.shape, strict=True))
-        i, j = int(u), int(v)
-        u, v = u - i, v - j
-        (a, b), (c, d) = ways[i : i + 2, j : j + 2].tolist()
-        slopes = (c - a) * (1 - v) + (d - b) * v, (b - a) * (1 - u) + (d - c) * u
-        return a + u * (c - a) + v * slopes[1], *(slope / WAY_CELL for slope in slopes)
-
-    def ahead(self, route, x, y):
-        """The point 0.6 m further along the best way from x, y (m, scalars) to goal `route`."""
-        for _ in range(4):
-            _, dx, dy = self.to_go(route, x, y)
-            size = math.hypot(dx, dy) + 1e-9
-            x, y = x - 0.15 * dx / size, y - 0.15 * dy / size
-        return x, y
+    def effort(self, x, y):
+        """`cost` at x, y (m, arrays); outside, that of the border."""
+        i, j = (x / CELL).astype(int), (y / CELL + self.cost.shape[1] / 2).astype(int)
+        return self.cost[np.clip(i, 0, len(self.cost) - 1), np.clip(j, 0, len(self.cost[0]) - 1)]
 
 
 # ---------------------------------------------------------------- meshes
@@ -258,12 +242,11 @@ def _flood(free, start):
     return np.maximum(steps, -1).reshape(free.shape)
 
 
-def _ways(z, free, goals):
-    """Terrain.ways to the cells `goals`, (i, j) each: when a front that starts there arrives.
+def _cost(z, free):
+    """Terrain.cost. A metre costs 1 where all is level and `free` for another 0.4 m around.
 
-    It solves |gradient of ways| = cost, the eikonal equation, upwind, sweep by sweep. A metre costs
-    1 where all is level and `free` for another 0.4 m around, up to 9 beside what is not free, and
-    50 there; and 1 more for each tenth of slope above 0.2.
+    It costs up to 9 beside what is not free, and 50 there; and 1 more for each tenth of slope above
+    0.2.
     """
     near, clear = ~free, np.zeros(free.shape, np.float32)
     for _ in range(4):
@@ -271,23 +254,7 @@ def _ways(z, free, goals):
         near = _window(near, 1, np.max)
     slope = np.minimum(np.hypot(*np.gradient(z, CELL)), 1)
     cost = 1 + 8 * (1 - clear) ** 2 + 10 * np.maximum(slope - 0.2, 0)
-    cost = np.where(free, cost, 50).astype(np.float32)
-    cost = np.pad(cost, [(0, n % 2) for n in free.shape], mode="edge")
-    m, n = np.array(cost.shape) // 2
-    cost = cost.reshape(m, 2, n, 2).min((1, 3)) * np.float32(WAY_CELL)
-    wide = np.full((len(goals), m + 2, n + 2), 1e4, np.float32)  # with a rim where nobody walks
-    ways, change = wide[:, 1:-1, 1:-1], True
-    for k, (i, j) in enumerate(goals):
-        ways[k, i // 2, j // 2] = 0
-    while change:
-        a = np.minimum(wide[:, :-2, 1:-1], wide[:, 2:, 1:-1])  # the earlier neighbour in x, in y
-        b = np.minimum(wide[:, 1:-1, :-2], wide[:, 1:-1, 2:])
-        apart = np.abs(a - b)
-        oblique = (a + b + np.sqrt(np.maximum(2 * cost**2 - apart**2, 0))) / 2
-        sooner = np.minimum(ways, np.where(apart < cost, oblique, np.minimum(a, b) + cost))
-        change = (sooner < ways - 1e-3).any()
-        ways[:] = sooner
-    return ways.copy()
+    return np.where(free, cost, 50).astype(np.float32)
 
 
 def _pick(rng, mask):
@@ -298,7 +265,7 @@ def _pick(rng, mask):
 
 def _routes(ground, rng, count, reach, climb=CLIMB, zones=((0, np.inf),), margin=0.5,
             floor=-np.inf):
-    """`count` starts (K, 4), goals (K, 3) and ways between, as in Terrain; None: there are none.
+    """`count` starts (K, 4), goals (K, 3) and the cost, as in Terrain; None: there are none.
 
     Start k lies in the k-th of `zones` (ranges of x, taken in turn); a goal lies `reach` = (least,
     most) metres from its start, measured straight; both keep `margin` m from the border and lie
@@ -313,7 +280,7 @@ def _routes(ground, rng, count, reach, climb=CLIMB, zones=((0, np.inf),), margin
     if home is None:
         return None
     met = inside & (_flood(free, home) >= 0)
-    starts, goals, ends = [], [], []
+    starts, goals = [], []
     for k in range(count):
         s = _pick(rng, zones[k % len(zones)] & met)
         if s is None:
@@ -324,8 +291,7 @@ def _routes(ground, rng, count, reach, climb=CLIMB, zones=((0, np.inf),), margin
             return None
         starts.append((x[s], y[s], z[s], np.arctan2(y[g] - y[s], x[g] - x[s])))
         goals.append((x[g], y[g], z[g]))
-        ends.append(g)
-    return np.array(starts), np.array(goals), _ways(z, free, ends)
+    return np.array(starts), np.array(goals), _cost(z, free)
 
 
 # ---------------------------------------------------------------- the training tasks

@@ -308,36 +308,26 @@ def test_the_cliffs_path_is_narrow_and_the_drop_deep():
         assert 0.9 <= width.min() and np.median(width) <= 2.2
 
 
-def test_ways_in_the_open_are_straight_distances():
-    """And fall by a metre a metre toward the goal, which is where `ahead` leads."""
-    ground, rng = make_terrain("flat", np.random.default_rng(0), 0.0), np.random.default_rng(1)
-    for k, (gx, gy, _) in enumerate(ground.goals):
-        for x, y in rng.uniform((1, -3), (11, 3), (20, 2)):
-            to_go, dx, dy = ground.to_go(k, x, y)
-            distance = np.hypot(gx - x, gy - y)
-            assert to_go == pytest.approx(distance, rel=0.08, abs=0.25)
-            if distance > 1:
-                toward = np.subtract((gx, gy), (x, y)) / distance
-                assert np.dot(toward, (-dx, -dy)) == pytest.approx(1, abs=0.08)
-                step = np.subtract(ground.ahead(k, x, y), (x, y))
-                assert np.hypot(*step) == pytest.approx(0.6, abs=0.02)
-                assert np.dot(toward, step) > 0.57
-
-
-def test_ways_cost_more_on_slopes_and_beside_what_is_not_free():
-    """On 6 x 6 m, nothing but the rim blocked: costs by hand, from the difference of two ways."""
+def test_a_metre_costs_more_on_slopes_and_beside_what_is_not_free():
+    """On 6 x 6 m, by hand: away from the rim slopes alone count, in a lane its walls."""
     free = np.ones((60, 60), bool)
     free[[0, -1]] = free[:, [0, -1]] = False
     x = np.broadcast_to((np.arange(60)[:, None] + 0.5) * 0.1, free.shape)
     for slope, cost in ((0.0, 1.0), (0.2, 1.0), (0.5, 4.0), (3.0, 9.0)):
-        ways = terrain._ways(slope * x, free, [(30, 30)])[0]
-        assert ways[15, 15] == 0
-        assert (ways[25, 15] - ways[20, 15]) / 1.0 == pytest.approx(cost, rel=0.02)
+        assert terrain._cost(slope * x, free)[10:50, 10:50] == pytest.approx(cost, rel=1e-3)
     free[:, :28] = free[:, 33:] = False  # a lane, five cells of 0.1 m wide
-    ways = terrain._ways(0 * x, free, [(30, 30)])[0]
+    cost = terrain._cost(0 * x, free)
     # Its middle is the third cell from what is blocked; from the fifth on there would be no charge.
-    assert ways[25, 15] - ways[20, 15] == pytest.approx(1 + 8 * (1 - 3 / 4) ** 2, rel=0.02)
-    assert ways[20, 10] - ways[20, 12] == pytest.approx(2 * 0.2 * 50, rel=0.01)  # into the wall
+    assert cost[25, 30] == pytest.approx(1 + 8 * (1 - 3 / 4) ** 2, rel=1e-3)
+    assert cost[25, 27] == 50
+
+
+def test_effort_is_that_of_the_ground_there_and_outside_that_of_the_border():
+    bar = make_terrain(lambda rng, difficulty: np.where(np.arange(60)[:, None] == 30, 1.0, 0.0)
+                       * np.ones(40) * (np.arange(40) < 20), np.random.default_rng(0), 1.0)
+    x, y = np.array([3.0, 6.1, 6.1, -5.0, 6.1]), np.array([0.0, -2.0, 2.5, 0.0, 99.0])
+    assert bar.effort(x, y).tolist() == [1, 50, 1, 50, 50]
+    assert bar.effort(x[:, None], y).shape == (5, 5)
 
 
 def test_doorways_of_the_offices():
