@@ -558,12 +558,12 @@ if "LocoMTRL-v0" not in gymnasium.registry:  # run as a script, this file is imp
 
 PACE = 0.21  # m, the guide's stride where his way is straight
 PATIENCE = 5  # s without getting on, after which he takes the robot by the hand
-# Where he looks: along lines all around (rad, from straight ahead), as far as the LiDAR does (m).
+# Where he looks: along lines all around (rad, from straight ahead), nearly as far as the LiDAR (m).
 _LINES, _ALONG = np.radians(np.arange(-180, 180, 10)), np.arange(0.3, 4.6, 0.3)[:, None]
 
 
 def advise(env):
-    """What a guide would do who sees what the robot could see, but knows it for what it is.
+    """What a guide would do who knows the ground around him, as far as the robot could see it.
 
     Of all places in sight he turns to the one with the least sum of: the distance left from there
     to the goal; the effort of the straight way there (`Terrain.cost`); two metres for each second
@@ -633,21 +633,24 @@ REWARD_SCALE = 0.1  # keeps the critic's targets near 1
 MAIN_STEPS = 3_000_000  # of the no-argument run
 SHORT_UNTIL = 200_000  # steps
 HARD = (0.4, 1.0)  # difficulties after that, when it knows how to walk
+FRESH = 4  # times that the main part of a training makes its layouts anew: more to see, less to
+# learn by heart
 # The gait decides these (all but stones are soon done), and the noise of their samples drowns what
 # the others teach, which need eyes: they rest between the first and the last part.
 BLIND_TASKS = ("rugged", "holes", "stones", "pyramids_up", "pyramids_down", "gaps", "hurdles",
                "blocks", "waves")
 
 
-def training_env(index, seed, tasks, guide_share=0.0, **options):
-    """Environment number `index` over all ranks: one of the tasks, on terrains of its own.
+def training_env(index, seed, tasks, guide_share=0.0, stage=0, **options):
+    """Environment number `index` over all ranks: one of the tasks, on layouts of its own.
 
     So all tasks have the same share of every batch. An env that drew its tasks would spend its
     time where the robot is stuck until time is up, little where it soon falls. A guide leads only
     where there is nothing but him to learn from: PPO needs actions that are the policy's own.
     """
-    env = gymnasium.make("LocoMTRL-v0", disable_env_checker=True, pool_seed=(seed, index),
-                         tasks=tasks[index % len(tasks)], terrains=len(tasks), **options)
+    env = gymnasium.make("LocoMTRL-v0", disable_env_checker=True,
+                         pool_seed=(seed, stage, index), tasks=tasks[index % len(tasks)],
+                         terrains=len(tasks), **options)
     env = Guide(env, leads=guide_share == 1) if guide_share else env
     return gymnasium.wrappers.TransformReward(env, lambda reward: REWARD_SCALE * reward)
 
@@ -677,7 +680,8 @@ def plan(args):
     if args.sequential:  # one task after the other (section 3), each for as long
         n = len(args.tasks)
         return [([task], (0, 1), (k + 1) / n, first) for k, task in enumerate(args.tasks)]
-    return [(args.tasks, (0, 1), start, first), (eyes, HARD, 0.8, middle),
+    ends = np.linspace(start, 0.8, FRESH + 1).tolist()
+    return [(args.tasks, (0, 1), start, first), *((eyes, HARD, end, middle) for end in ends[1:]),
             (args.tasks, HARD, 1.0, last)]
 
 
@@ -690,8 +694,6 @@ def train(args):
     """`train`: one rank per core unless torchrun has started us already."""
     run_dir = Path(args.run_dir)
     if "WORLD_SIZE" not in os.environ and args.ranks > 1:
-        if args.resume:
-            load_checkpoint(run_dir / "checkpoint.pt")  # a bad one is better named by one process
         return launch(args)
     options = {"tg": args.tg, "lidar": args.lidar, "paper": args.paper}
     meta = {**options, "tasks": args.tasks, "sequential": args.sequential, "guide": args.guide,
@@ -709,7 +711,10 @@ def train(args):
     resume, on_update = args.resume or restarted, tensorboard(run_dir) if args.tensorboard else None
     try:
         # Each stage resumes the one before.
-        for tasks, difficulty, share, settings in stages:
+        for k, (tasks, difficulty, share, settings) in enumerate(stages):
+            resume |= k > 0
+            if args.stage not in (None, k):
+                continue
             # At least 20 environments, as many for each task, shared among the ranks.
             num_envs = math.ceil(len(tasks) * math.ceil(20 / len(tasks)) / ranks)
             config = PPOConfig(
@@ -721,16 +726,18 @@ def train(args):
                 gae_lambda=0.98, max_advantage=1.0, **settings,
             )
             make_env = functools.partial(training_env, seed=args.seed, tasks=tasks,
-                                         guide_share=config.guide_share, difficulty=difficulty,
-                                         **options)
+                                         guide_share=config.guide_share, stage=k,
+                                         difficulty=difficulty, **options)
             learn(make_env, config, run_dir=run_dir, resume=resume, mirror=mirror, meta=meta,
                   episode_keys=("t_cr", "success", "fall", "exploded"), groups=args.tasks,
                   on_update=on_update)
-            resume = True
     except KeyboardInterrupt:
         if int(os.environ.get("RANK", 0)) == 0:
             print(f"\nStopped. To go on from the last checkpoint: {_again(args)}")
         return 130
+    finally:
+        if torch.distributed.is_initialized():  # its threads would abort a process that just ends
+            torch.distributed.destroy_process_group()
     if int(os.environ.get("RANK", 0)) == 0:
         checkpoint = load_checkpoint(run_dir / "checkpoint.pt")
         # To be shared: who acts needs no critic, and half the bits change an action by less than a
@@ -740,7 +747,8 @@ def train(args):
                                for name, tensor in checkpoint["model"].items()
                                if not name.startswith("critic.")}
         torch.save(checkpoint, run_dir / "policy.pt")
-        print(f"Policy: {run_dir / 'policy.pt'}   Curve: {run_dir / 'curve.png'}")
+        if args.stage is None:
+            print(_made(run_dir))
     return 0
 
 
@@ -760,29 +768,50 @@ def tensorboard(run_dir):
     return on_update
 
 
+LOST = 3  # exit code of a rank that ends because another one is gone
+
+
 def launch(args):
-    """Starts one rank per core through torch's own launcher, and waits for them."""
+    """Starts one rank per core through torch's own launcher, and waits for them.
+
+    Once for each stage of the training: Bullet gives a layout's memory back only when its process
+    ends.
+    """
     import torch.distributed.run as torchrun
     from torch.distributed.elastic.multiprocessing import SignalException
     from torch.distributed.elastic.multiprocessing.errors import ChildFailedError
 
     logging.getLogger("torch.distributed.elastic").setLevel(logging.CRITICAL)
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # what torchrun would set, with a warning
+    command = ["--standalone", f"--nproc-per-node={args.ranks}", __file__, *args.argv, "--stage"]
+    run_dir = Path(args.run_dir)
     try:
-        torchrun.main(["--standalone", f"--nproc-per-node={args.ranks}", __file__, *args.argv])
+        for k, (_, _, share, _) in enumerate(plan(args)):
+            if k or args.resume:  # a bad checkpoint is better named by one process
+                checkpoint = load_checkpoint(run_dir / "checkpoint.pt")
+                if checkpoint["counters"]["steps"] >= round(share * args.steps):
+                    continue
+            torchrun.main([*command, str(k)])
     except SignalException as stop:
         return 128 + stop.sigval
     except ChildFailedError as error:
-        # The launcher ends the other ranks by SIGTERM, and may record that as the first failure.
-        failures = {rank: failure for rank, failure in error.failures.items()
-                    if failure.exitcode != -signal.SIGTERM} or error.failures
-        rank, failure = min(failures.items(), key=lambda item: item[1].timestamp)
-        if failure.exitcode > 0:
-            return failure.exitcode  # the rank itself has said what is wrong
-        print(f"loco_mtrl.py: error: rank {rank} was killed by signal {-failure.exitcode}. "
+        codes = {rank: failure.exitcode for rank, failure in error.failures.items()}
+        for code in codes.values():
+            if code > 0 and code != LOST:
+                return code  # that rank itself has said what is wrong
+        # The launcher ends the other ranks by SIGTERM, and may record that, too.
+        killed = [rank for rank, code in codes.items() if code not in (LOST, -signal.SIGTERM)]
+        rank = (killed or list(codes))[0]
+        print(f"loco_mtrl.py: error: rank {rank} was killed by signal {-codes[rank]}. "
               f"To go on from the last checkpoint: {_again(args)}", file=sys.stderr)
         return 1
+    print(_made(run_dir))
     return 0
+
+
+def _made(run_dir):
+    """Where a finished training has left what a person needs."""
+    return f"Policy: {run_dir / 'policy.pt'}   Curve: {run_dir / 'curve.png'}"
 
 
 def _again(args):
@@ -1098,6 +1127,7 @@ def parse(argv):
     p.add_argument("--resume", action="store_true", help="go on from the run's checkpoint")
     p.add_argument("--tensorboard", action="store_true", help="log for TensorBoard, too")
     p.add_argument("--ranks", type=_whole(1), default=cores, help="processes; default: every core")
+    p.add_argument("--stage", type=_whole(0), help=argparse.SUPPRESS)  # see launch
     p.set_defaults(run=train)
 
     p = commands.add_parser("eval", help="score policies in worlds they never saw")
@@ -1128,7 +1158,7 @@ def parse(argv):
     p.set_defaults(run=gallery)
 
     args = parser.parse_args(argv)
-    args.argv = argv
+    args.argv = argv[:-2] if getattr(args, "stage", None) is not None else argv
     return args
 
 
@@ -1142,7 +1172,7 @@ def main(argv=None):
         return code
     except (ValueError, OSError, FloatingPointError) as error:
         print(f"loco_mtrl.py: error: {error}", file=sys.stderr)
-        return 2
+        return LOST if isinstance(error, ConnectionError) else 2
 
 
 if __name__ == "__main__":

@@ -284,8 +284,8 @@ def test_the_guide_reaches_the_goal_of_a_world(world):
 
 
 @pytest.mark.parametrize(("arguments", "shares"), [
-    ([], [1.0, 1.0, 0.5]), (["--no-guide"], [0.0] * 3), (["--paper"], [0.0] * 3),
-    (["--no-tg"], [0.0] * 3), (["--no-lidar"], [1.0, 1.0, 0.5]),
+    ([], [1.0] * 5 + [0.5]), (["--no-guide"], [0.0] * 6), (["--paper"], [0.0] * 6),
+    (["--no-tg"], [0.0] * 6), (["--no-lidar"], [1.0] * 5 + [0.5]),
     (["--sequential", "--tasks", "flat,walls"], [1.0, 1.0]),
 ])
 def test_who_learns_from_the_guide(arguments, shares):
