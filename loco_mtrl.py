@@ -633,8 +633,9 @@ REWARD_SCALE = 0.1  # keeps the critic's targets near 1
 MAIN_STEPS = 3_000_000  # of the no-argument run
 SHORT_UNTIL = 200_000  # steps
 HARD = (0.4, 1.0)  # difficulties after that, when it knows how to walk
-FRESH = 4  # times that the main part of a training makes its layouts anew: more to see, less to
-# learn by heart
+# Layouts of an environment, at most, and how often the main part of a training makes them anew: the
+# more it sees, the less it learns by heart.
+LAYOUTS, FRESH = 10, 4
 # The gait decides these (all but stones are soon done), and the noise of their samples drowns what
 # the others teach, which need eyes: they rest between the first and the last part.
 BLIND_TASKS = ("rugged", "holes", "stones", "pyramids_up", "pyramids_down", "gaps", "hurdles",
@@ -650,7 +651,7 @@ def training_env(index, seed, tasks, guide_share=0.0, stage=0, **options):
     """
     env = gymnasium.make("LocoMTRL-v0", disable_env_checker=True,
                          pool_seed=(seed, stage, index), tasks=tasks[index % len(tasks)],
-                         terrains=len(tasks), **options)
+                         terrains=min(len(tasks), LAYOUTS), **options)
     env = Guide(env, leads=guide_share == 1) if guide_share else env
     return gymnasium.wrappers.TransformReward(env, lambda reward: REWARD_SCALE * reward)
 
