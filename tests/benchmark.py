@@ -1,9 +1,10 @@
-"""How fast the project is, as a table: `python tests/benchmark.py`, about 8 minutes.
+"""How fast the project is, as a table: `python tests/benchmark.py`, about 10 minutes.
 
 Asserts nothing, for times depend on the machine: run it on an idle one and compare the ratios.
 """
 
 import csv
+import math
 import subprocess
 import sys
 import tempfile
@@ -13,8 +14,10 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 import psutil
+import torch
 
 import loco_mtrl
+import ppo
 from loco_mtrl import LAIKAGO, PILLAR_TASKS, LocoEnv, training_env
 
 STEPS = 2000
@@ -40,17 +43,17 @@ class NaiveEnv(LocoEnv):
         self.joints = [ids[name] for name in names]
 
 
-def timed(env, name, spent):
-    """Adds the seconds inside one of Bullet's functions to `spent`."""
-    function = getattr(env.bullet, name)
+def timed(owner, name, spent):
+    """From now on the seconds of each call of owner.name are listed in spent[name]."""
+    function = getattr(owner, name)
 
     def wrapper(*args, **kwargs):
         start = time.perf_counter()
         result = function(*args, **kwargs)
-        spent[name] = spent.get(name, 0.0) + time.perf_counter() - start
+        spent.setdefault(name, []).append(time.perf_counter() - start)
         return result
 
-    setattr(env.bullet, name, wrapper)
+    setattr(owner, name, wrapper)
 
 
 def walk(env, steps, spent=None):
@@ -58,7 +61,7 @@ def walk(env, steps, spent=None):
     rng = np.random.default_rng(0)
     env.reset(seed=0)
     for name in ("stepSimulation", "rayTestBatch") if spent is not None else ():
-        timed(env, name, spent)
+        timed(env.bullet, name, spent)
     resets, elapsed = [], 0.0
     for _ in range(steps):
         action = rng.normal(0, 0.2, env.action_space.shape)
@@ -89,6 +92,20 @@ def training(ranks):
     return steps / minutes / 60, learn / (collect + learn)
 
 
+def precautions(rate):
+    """Share of a training's time, at `rate` steps/s, for checkpoints, curves and checks for NaN."""
+    spent, steps = {}, 30_000
+    for name in ("save_checkpoint", "draw_curve"):
+        timed(ppo, name, spent)
+    timed(torch.Tensor, "isfinite", spent)  # of the parameters
+    timed(math, "isfinite", spent)  # of every action: mostly the wrapper's own time
+    with tempfile.TemporaryDirectory() as folder:
+        loco_mtrl.main(["train", "--ranks", "1", "--steps", str(steps), "--run-dir", folder])
+    checkpoint = np.mean(spent["save_checkpoint"]) + np.mean(spent["draw_curve"])
+    between = 10_000 * len(PILLAR_TASKS)  # steps from one checkpoint to the next
+    return checkpoint * rate / between + sum(spent["isfinite"]) * rate / steps
+
+
 def memory():
     """MB of one rank with all tasks, and its growth from the 500th to the 5,000th reset."""
     make = [lambda i=i: training_env(i, 0, tasks=list(PILLAR_TASKS)) for i in range(12)]
@@ -108,11 +125,11 @@ def main():
     step, reset = walk(env, STEPS)
     measured, _ = walk(env, STEPS, spent)
     env.close()
-    inside = sum(spent.values()) / STEPS
+    inside = sum(map(sum, spent.values())) / STEPS
     naive, _ = walk(NaiveEnv("rugged", difficulty=0.5), 200)
     rows.append(("steps/s on one core, rugged pillars, 240 rays", f"{1 / step:.0f}"))
     for name, seconds in spent.items():
-        rows.append((f"  ms a step in {name}", f"{seconds / STEPS * 1e3:.3f}"))
+        rows.append((f"  ms a step in {name}", f"{sum(seconds) / STEPS * 1e3:.3f}"))
     rows.append(("  share inside those two", f"{inside / measured:.2f}"))
     rows.append(("one box per pillar and the URDF's meshes: slower by", f"{naive / step:.0f}x"))
     rows.append(("reset", f"{reset * 1e3:.1f} ms"))
@@ -127,6 +144,7 @@ def main():
     rows.append(("training steps/s, 2 ranks", f"{two:.0f}"))
     rows.append(("  times those of 1 rank, two pairs", ratios))
     rows.append(("  share of learning", f"{share:.2f}"))
+    rows.append(("share of checkpoints, curves, checks for NaN", f"{precautions(one):.2%}"))
     for name, value in rows:
         print(f"{name:55}{value:>15}")
 
