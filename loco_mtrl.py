@@ -557,7 +557,6 @@ if "LocoMTRL-v0" not in gymnasium.registry:  # run as a script, this file is imp
 # ------------------------------------------------------------------------------- the guide
 
 PACE = 0.21  # m, the guide's stride where his way is straight
-PATIENCE = 5  # s without getting on, after which he takes the robot by the hand
 # Where he looks: along lines all around (rad, from straight ahead), nearly as far as the LiDAR (m).
 _LINES, _ALONG = np.radians(np.arange(-180, 180, 10)), np.arange(0.3, 4.6, 0.3)[:, None]
 
@@ -595,36 +594,15 @@ class Guide(gymnasium.Wrapper):
     He is no part of the policy, only of what it learns from: to recognise, in what its own senses
     tell, which way he would go. (n_act,), NaN for all but the two strides: the rest it finds out
     for itself.
-
-    If he `leads`, he takes a robot that stays within half a metre for PATIENCE by the hand, until
-    it has come 1.5 m in that time: one that is stuck has little to teach. Its t_cr and success in
-    info then remain what they were when it last walked alone.
     """
-
-    def __init__(self, env, leads=False):
-        super().__init__(env)
-        self.leads = leads
 
     def reset(self, **kwargs):
         observation, info = self.env.reset(**kwargs)
-        self.leading, self.verdict = False, {}
-        return observation, self._guided(info)
+        return observation, info | {"guide": advise(self.unwrapped)}
 
     def step(self, action):
-        if self.leading:
-            action = np.where(np.isnan(self.advice), action, self.advice)
         *rest, info = self.env.step(action)
-        return *rest, self._guided(info)
-
-    def _guided(self, info):
-        env = self.unwrapped
-        self.advice = advise(env)
-        if self.leads and not env.exploded and len(env.trail) > PATIENCE:
-            moved = math.dist(env.position[:2], env.trail[-1 - PATIENCE])
-            self.leading = moved < (1.5 if self.leading else 0.5)
-            if self.leading and not self.verdict:  # what the robot has reached alone
-                self.verdict = {"t_cr": info["t_cr"], "success": False}
-        return info | self.verdict | {"guide": self.advice}
+        return *rest, info | {"guide": advise(self.unwrapped)}
 
 
 # ------------------------------------------------------------------------------- train
@@ -642,17 +620,16 @@ BLIND_TASKS = ("rugged", "holes", "stones", "pyramids_up", "pyramids_down", "gap
                "blocks", "waves")
 
 
-def training_env(index, seed, tasks, guide_share=0.0, stage=0, **options):
+def training_env(index, seed, tasks, guide=False, stage=0, **options):
     """Environment number `index` over all ranks: one of the tasks, on layouts of its own.
 
     So all tasks have the same share of every batch. An env that drew its tasks would spend its
-    time where the robot is stuck until time is up, little where it soon falls. A guide leads only
-    where there is nothing but him to learn from: PPO needs actions that are the policy's own.
+    time where the robot is stuck until time is up, little where it soon falls.
     """
     env = gymnasium.make("LocoMTRL-v0", disable_env_checker=True,
                          pool_seed=(seed, stage, index), tasks=tasks[index % len(tasks)],
                          terrains=min(len(tasks), LAYOUTS), **options)
-    env = Guide(env, leads=guide_share == 1) if guide_share else env
+    env = Guide(env) if guide else env
     return gymnasium.wrappers.TransformReward(env, lambda reward: REWARD_SCALE * reward)
 
 
@@ -727,7 +704,7 @@ def train(args):
                 gae_lambda=0.98, max_advantage=1.0, **settings,
             )
             make_env = functools.partial(training_env, seed=args.seed, tasks=tasks,
-                                         guide_share=config.guide_share, stage=k,
+                                         guide=config.guide_share > 0, stage=k,
                                          difficulty=difficulty, **options)
             learn(make_env, config, run_dir=run_dir, resume=resume, mirror=mirror, meta=meta,
                   episode_keys=("t_cr", "success", "fall", "exploded"), groups=args.tasks,

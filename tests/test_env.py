@@ -312,25 +312,6 @@ def test_the_guide_turns_to_the_goal(yaw, turns):
         assert (left + right) / 2 == pytest.approx(0.21 * max(0, math.cos(yaw)) ** 2, abs=0.05)
 
 
-@pytest.mark.parametrize("leads", [True, False])
-def test_a_guide_who_leads_takes_the_robot_on_when_it_stays(leads):
-    """A robot that treads on the spot: after 5 s it is led, until it gets on, and is left again."""
-    with closing(Guide(LocoEnv("flat"), leads)) as env:
-        _, info = env.reset(seed=0)
-        robot, led, still = env.unwrapped, [], np.zeros(17)
-        still[1:3] = -0.13 / 0.27  # strides of 0 m
-        while robot.time < 12:
-            *_, info = env.step(still)
-            led.append(env.leading)
-    assert not any(led[: round(4.9 / DT)]) and any(led) == leads
-    assert info["t_cr"] < 0.1  # what it has done alone
-    progress = robot.start_distance - robot.distance
-    assert progress > 0.5 if leads else abs(progress) < 0.3
-    if leads:
-        assert not led[-1] or led.index(True) < led.index(False, led.index(True))
-        assert sum(led) * DT < 6
-
-
 def test_the_guide_does_not_stay_where_he_has_been_for_long():
     """Before a wall with the goal behind it: at first he goes up to it, later he turns away."""
     with closing(LocoEnv(wall_ahead)) as env:
