@@ -34,6 +34,7 @@ from terrain import (
     PERSON_RADIUS,
     PILLAR_TASKS,
     WORLDS,
+    Chart,
     Terrain,
     load_mesh,
     make_terrain,
@@ -153,6 +154,21 @@ _LEFTWARD = np.radians(LIDAR_AZIMUTHS[0])
 _AROUND = np.stack([np.cos(_LEFTWARD), np.sin(_LEFTWARD)], 1)
 MEMORY_POINTS = np.concatenate([radius * _AROUND for radius in MEMORY_RADII])  # (48, 2)
 
+# The chart: a map that the robot draws as it goes (terrain.Chart), told as the effort of going as
+# far as these (m) along each column. It is drawn anew every CHART_EVERY control steps.
+CHART_RADII, CHART_EVERY = (0.6, 1.5, 2.7, 4.5), 10
+_PACES = np.arange(0.3, 4.6, 0.3)  # m, the points of a straight way whose costs are summed
+_CHARTED = np.isin(np.round(_PACES, 1), CHART_RADII)
+
+
+def way_effort(effort, x, y, angles):
+    """Effort of straight ways from x, y (m) along `angles` (rad, (A,)) to each of _PACES: (15, A).
+
+    `effort` as in Terrain.effort; a metre in the open counts 0.4. Returns the points' x, y, too.
+    """
+    px, py = x + _PACES[:, None] * np.cos(angles), y + _PACES[:, None] * np.sin(angles)
+    return 0.12 * effort(px, py).cumsum(0), px, py  # 0.3 m a step
+
 
 # ------------------------------------------------------------------------------- the environment
 
@@ -188,11 +204,12 @@ def _about_z(yaw):
 class LocoEnv(gymnasium.Env):
     """A Laikago walks to a goal over terrain that only its LiDAR shows it (section 2).
 
-    ## Observation: Box((332,), float32), in the order of section 2.1
+    ## Observation: Box((428,), float32), in the order of section 2.1
     | entries | meaning | unit |
     |---|---|---|
     | 240 | r, LiDAR scan: sqrt(distance / 5 m), 1: no hit; rows from low to high, left to right | |
     | 48 | memory: time spent lately 0.7 m and 2 m away along each column, log scale; ours | |
+    | 96 | chart: effort of 0.6, 1.5, 2.7, 4.5 m along each column in the robot's own map; ours | |
     | 1 | g_d, distance to the goal | m |
     | 1 | g_h, heading of the goal relative to the robot's, left positive | rad |
     | 3 | angular rates of the base in its own frame (IMU) | rad/s |
@@ -258,7 +275,8 @@ class LocoEnv(gymnasium.Env):
         self.generator = TrajectoryGenerator() if tg else None
         self._connect(gui)
         rows, columns = LIDAR_AZIMUTHS.shape
-        self.scan_shape = rows * lidar + len(MEMORY_RADII) * (not paper), columns
+        rows = rows * lidar + len(MEMORY_RADII) * (not paper)
+        self.scan_shape = rows + len(CHART_RADII) * (lidar and not paper), columns
         self.lidar, self.paper = lidar, paper
         n_scan = math.prod(self.scan_shape)
         self.scan = np.zeros(n_scan, np.float32)
@@ -308,6 +326,7 @@ class LocoEnv(gymnasium.Env):
             sphere = p.createVisualShape(p.GEOM_SPHERE, radius=0.2, rgbaColor=(0.2, 0.8, 0.3, 1))
             self.flag = p.createMultiBody(0, -1, sphere)
         self._rays = sources.tolist(), (sources + LIDAR_RANGE * directions).tolist()
+        self._eyes, self._reach = sources, LIDAR_RANGE * directions
         self._gains = dict(positionGains=[POSITION_GAIN] * 12, velocityGains=[VELOCITY_GAIN] * 12,
                            forces=[MAX_TORQUE] * 12)
         for _ in range(3):  # Bullet files what stands still elsewhere after two steps: it would
@@ -386,6 +405,7 @@ class LocoEnv(gymnasium.Env):
         for joint, angle in zip(self.joints, self.target, strict=True):
             p.resetJointState(self.robot, joint, angle)
         self.time, self.steps, self.collisions, self.trail = 0.0, 0, 0, []
+        self.chart = Chart()
         self.touching = self.exploded = False
         for body in self.people:  # not all terrains have as many
             p.resetBasePositionAndOrientation(body, (0, 0, -1000), (0, 0, 0, 1))
@@ -475,9 +495,23 @@ class LocoEnv(gymnasium.Env):
             fractions = np.fromiter(map(HIT_FRACTION, self.hits), np.float32, N_RAYS)
             self.scan[:N_RAYS] = np.sqrt(fractions)
         if turn_lidar and not self.paper:
-            self.scan[self.scan.size - len(MEMORY_POINTS) :] = self._been_there(r)
+            first = N_RAYS * self.lidar
+            self.scan[first : first + len(MEMORY_POINTS)] = self._been_there(r)
+            if self.lidar:
+                self.scan[first + len(MEMORY_POINTS) :] = self._draw_chart(r, fractions)
         observation[: self.scan.size] = self.scan
         return observation
+
+    def _draw_chart(self, r, fractions):
+        """Enters a scan into the chart, and tells its effort along each column, on a log scale."""
+        turn, (x, y, z) = np.reshape(r, (3, 3)).T, self.position
+        eyes = self._eyes @ turn + self.position
+        hits = eyes + fractions[:, None] * (self._reach @ turn)
+        self.chart.see(eyes, hits, fractions < 1, z - BASE_HEIGHT)
+        if self.steps % CHART_EVERY == 0:
+            self.chart.draw(x, y, z - BASE_HEIGHT)
+        effort, _, _ = way_effort(self.chart.effort, x, y, self.yaw + _LEFTWARD)
+        return (np.log1p(effort[_CHARTED]) / math.log1p(90)).ravel()  # 90: all the way in a wall
 
     def _been_there(self, r):
         """Memory: time spent around each of MEMORY_POINTS, on a log scale; `r`: base to world."""
@@ -557,8 +591,7 @@ if "LocoMTRL-v0" not in gymnasium.registry:  # run as a script, this file is imp
 # ------------------------------------------------------------------------------- the guide
 
 PACE = 0.21  # m, the guide's stride where his way is straight
-# Where he looks: along lines all around (rad, from straight ahead), nearly as far as the LiDAR (m).
-_LINES, _ALONG = np.radians(np.arange(-180, 180, 10)), np.arange(0.3, 4.6, 0.3)[:, None]
+_LINES = np.radians(np.arange(-180, 180, 10))  # where he looks: all around, from straight ahead
 
 
 def advise(env):
@@ -575,8 +608,7 @@ def advise(env):
     (x, y, _), (to_x, to_y, _) = np.subtract((env.position, env.goal), env.origin)
     turn = math.remainder(math.atan2(to_y - y, to_x - x) - env.yaw, 2 * math.pi)
     if env.distance > 0.7:
-        px, py = x + _ALONG * np.cos(env.yaw + _LINES), y + _ALONG * np.sin(env.yaw + _LINES)
-        effort = 0.12 * env.terrain.effort(px, py).cumsum(0)  # 0.3 m a step, 0.4 for each metre
+        effort, px, py = way_effort(env.terrain.effort, x, y, env.yaw + _LINES)
         total = np.hypot(px - to_x, py - to_y) + effort + np.abs(_LINES) / np.pi
         total += 2 * env.time_around(px + env.origin[0], py)
         turn = _LINES[total.min(0).argmin()]

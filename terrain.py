@@ -8,13 +8,13 @@ Frame: x runs along the m pillars from 0, y along the n pillars with 0 in the mi
 lengths are in metres and all angles in radians unless a name says otherwise.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 
 L = W = 0.2  # m, cross-section of a training pillar
 SHAPE = (60, 40)  # m x n pillars: 12 m x 8 m
@@ -25,6 +25,9 @@ STEP = 0.2  # m, highest step that they clear at all: what training may ask for
 FLAT = 0.05  # m, most that the ground under a start may vary
 PAD = 9  # pillars, depth of the flat strip at both ends where episodes start (1.8 m)
 ROUTES = 8  # start and goal pairs per training terrain
+CHART = 0.2  # m, squares of the map that a robot draws
+DROP = 0.25  # m below the robot's feet from where on a ray has passed an edge
+FADE = 0.985  # of heights in that map, each time that it is drawn
 TRIES = 20  # redraws before a generator is said to yield no route
 
 PERSON_RADIUS, PERSON_HEIGHT = 0.25, 1.7  # m, the body that an environment gives a Person
@@ -199,10 +202,14 @@ def fuse_pillars(heights, l, w):  # noqa: E741 - the paper's own names
 
 
 def _window(a, radius, pick):
-    """`pick` (np.max or np.min) over the square of +-`radius` cells around each cell."""
+    """`pick` (np.maximum or np.minimum) over the square of +-`radius` cells around each cell."""
     for _ in range(2):
-        a = np.pad(a, ((radius, radius), (0, 0)), mode="edge")
-        a = pick(sliding_window_view(a, 2 * radius + 1, axis=0), axis=-1).T
+        n = len(a)
+        padded = a[np.arange(-radius, n + radius).clip(0, n - 1)]
+        a = padded[:n]
+        for shift in range(1, 2 * radius + 1):
+            a = pick(a, padded[shift : shift + n])
+        a = a.T
     return a
 
 
@@ -217,14 +224,14 @@ def _navigation(ground, climb):
     i, j = np.indices((nx, ny))
     x, y = (i + 0.5) * CELL, (j + 0.5 - ny / 2) * CELL
     z = np.maximum(ground(x, y), -1e3)
-    filled = _window(_window(z, 1, np.max), 1, np.min)
+    filled = _window(_window(z, 1, np.maximum), 1, np.minimum)
     edge = np.ones(z.shape, bool)
     edge[1:-1, 1:-1] = False
     for shift in ((1, 0), (0, 1), (1, 1), (1, -1)):  # what wraps round lands on the edge
         step = np.abs(filled - np.roll(filled, shift, (0, 1))) > climb * np.hypot(*shift) + 1e-6
         edge |= step | np.roll(step, np.negative(shift), (0, 1))
-    free = ~_window(edge, 1, np.max)  # cells beside an edge and theirs: centres nearer than 0.25 m
-    stand = free & (_window(z, 5, np.max) - _window(z, 5, np.min) <= FLAT)
+    free = ~_window(edge, 1, np.maximum)  # cells beside an edge and theirs: nearer than 0.25 m
+    stand = free & (_window(z, 5, np.maximum) - _window(z, 5, np.minimum) <= FLAT)
     return x, y, z, free, stand, z > filled - 0.02
 
 
@@ -242,18 +249,18 @@ def _flood(free, start):
     return np.maximum(steps, -1).reshape(free.shape)
 
 
-def _cost(z, free):
+def _cost(z, free, cell=CELL):
     """Terrain.cost. A metre costs 1 where all is level and `free` for another 0.4 m around.
 
     It costs up to 9 beside what is not free, and 50 there; and 1 more for each tenth of slope above
-    0.2.
+    0.2. Where z is NaN nothing is known of slopes, nor paid for them.
     """
-    near, clear = ~free, np.zeros(free.shape, np.float32)
-    for _ in range(4):
-        clear += ~near / 4
-        near = _window(near, 1, np.max)
-    slope = np.minimum(np.hypot(*np.gradient(z, CELL)), 1)
-    cost = 1 + 8 * (1 - clear) ** 2 + 10 * np.maximum(slope - 0.2, 0)
+    near, clear, rings = ~free, np.zeros(free.shape, np.float32), round(0.4 / cell)
+    for _ in range(rings):
+        clear += ~near / np.float32(rings)
+        near = _window(near, 1, np.maximum)
+    slope = np.minimum(np.hypot(*np.gradient(z, cell)), 1)
+    cost = 1 + 8 * (1 - clear) ** 2 + 10 * np.fmax(slope - 0.2, 0)
     return np.where(free, cost, 50).astype(np.float32)
 
 
@@ -292,6 +299,61 @@ def _routes(ground, rng, count, reach, climb=CLIMB, zones=((0, np.inf),), margin
         starts.append((x[s], y[s], z[s], np.arctan2(y[g] - y[s], x[g] - x[s])))
         goals.append((x[g], y[g], z[g]))
     return np.array(starts), np.array(goals), _cost(z, free)
+
+
+class Chart:
+    """What a robot has seen of the ground, a map that it draws itself from its LiDAR's hits.
+
+    Squares of CHART m a side know the lowest and the highest hit in them, and whether a ray has
+    gone over them to something lower. The map is a torus of 51 m: it has no border, and needs none.
+    """
+
+    size, half = 256, 24  # squares: of all the map, and from the robot to what is looked at
+
+    def __init__(self):
+        self.low, self.high, self.below = np.full((3, self.size**2), np.nan, np.float32)
+
+    def _at(self, points):
+        i, j = np.floor(points[:, :2].T / CHART).astype(int) % self.size
+        return i * self.size + j
+
+    def see(self, eyes, hits, hit, ground):
+        """Enters a scan: rays from `eyes` to `hits` (R, 3) m, where they end by a `hit` (R,) or in
+        the air; `ground`: m, the height on which the robot stands.
+        """
+        ends = hits[hit]
+        at, z = self._at(ends), ends[:, 2].astype(np.float32)
+        np.fmin.at(self.low, at, z)
+        np.fmax.at(self.high, at, z)
+        # Where a ray passes a step below, the ground can be no higher.
+        level = np.float32(ground - DROP)
+        over = hits[:, 2] < level
+        a, b = eyes[over], hits[over]
+        part = (level - a[:, 2]) / (b[:, 2] - a[:, 2])
+        np.fmin.at(self.below, self._at(a + part[:, None] * (b - a)), level)
+
+    def draw(self, x, y, ground):
+        """Works out `effort` anew around x, y (m), as far as 4.8 m away; `ground` as in `see`."""
+        self.corner = [math.floor(c / CHART) - self.half for c in (x, y)]
+        i, j = ((c + np.arange(2 * self.half + 1)) % self.size for c in self.corner)
+        at = i[:, None] * self.size + j
+        low, high, below = self.low[at], self.high[at], self.below[at]
+        self.high[at] = low + FADE * (high - low)  # people shall leave no walls behind
+        z = (low + high) / 2  # NaN: not seen yet
+        edge = high - low > STEP
+        off = np.abs(z - ground)  # of two squares with a step between, the odd one is in the way
+        for one, other in ((np.s_[1:], np.s_[:-1]), (np.s_[:, 1:], np.s_[:, :-1])):
+            step, odd = np.abs(z[one] - z[other]) > STEP, off[one] > off[other]
+            edge[one] |= step & odd
+            edge[other] |= step & ~odd
+        edge |= np.isnan(z) & (_window(z, 2, np.fmax) - below > STEP)
+        self.cost = _cost(z, ~_window(edge, 1, np.maximum), CHART)
+
+    def effort(self, x, y):
+        """As Terrain.effort, as far as is known; the unknown is open ground."""
+        i, j = (np.floor(c / CHART).astype(int) - low
+                for c, low in zip((x, y), self.corner, strict=True))
+        return self.cost[i.clip(0, 2 * self.half), j.clip(0, 2 * self.half)]
 
 
 # ---------------------------------------------------------------- the training tasks

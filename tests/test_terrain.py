@@ -415,3 +415,56 @@ def test_bad_meshes_are_named(tmp_path):
 def _write(path, text):
     path.write_text(text)
     return path
+
+
+def sweep(chart, ground, eye, times=1):
+    """Enters what 72 x 25 level to steep rays of 5 m see of `ground`(x, y) from `eye` (x, y, z)."""
+    turn, down = np.radians(np.arange(0, 360, 5)), np.radians(np.arange(-3, 72, 3))
+    turn, down = (a.ravel() for a in np.meshgrid(turn, down))
+    ray = np.stack([np.cos(down) * np.cos(turn), np.cos(down) * np.sin(turn), -np.sin(down)], 1)
+    along = eye + ray * np.arange(0.02, 5, 0.02)[:, None, None]  # (steps, rays, 3)
+    inside = along[..., 2] <= ground(along[..., 0], along[..., 1])
+    hit = inside.any(0)
+    ends = along[np.where(hit, inside.argmax(0), -1), np.arange(len(turn))]
+    for _ in range(times):
+        chart.see(np.broadcast_to(eye, ends.shape), ends, hit, 0.0)
+        chart.draw(eye[0], eye[1], 0.0)
+
+
+@pytest.mark.parametrize("shape, x, blocked", [
+    ("flat", 0.7, False), ("wall", 0.7, True), ("wall", -0.7, False), ("drop", 0.7, True),
+    ("drop", -0.7, False), ("ramp", 0.7, False), ("kerb", 0.7, False)])
+def test_chart_knows_walls_and_edges_and_lets_ramps_and_kerbs_be(shape, x, blocked):
+    """All of them begin at x = 0.6 m, across the way of a robot whose lens has come to 0.2 m."""
+    ground = {"flat": lambda x, y: 0 * x, "wall": lambda x, y: np.where(x > 0.6, 1.0, 0.0),
+              "drop": lambda x, y: np.where(x > 0.6, -1.2, 0.0),
+              "ramp": lambda x, y: 0.36 * np.maximum(x - 0.6, 0),  # 20 degrees
+              "kerb": lambda x, y: np.where(x > 0.6, 0.1, 0.0)}[shape]
+    chart = terrain.Chart()
+    for eye in (0.0, 0.1, 0.2):
+        sweep(chart, ground, np.array([eye, 0.0, 0.38]))
+    y = np.linspace(-0.5, 0.5, 11)
+    assert (chart.effort(np.full(11, x), y) > 40).all() == blocked
+    assert blocked or (chart.effort(np.full(11, x), y) < 40).all()
+    assert (chart.effort(np.full(11, -0.3), y) < 4).all()  # nearer there is nothing
+
+
+def test_chart_takes_the_unknown_for_open_ground_and_forgets_people():
+    chart = terrain.Chart()
+    person = lambda x, y: np.where(np.hypot(x - 2, y) < 0.3, 1.7, 0.0)  # noqa: E731
+    eye = np.array([0.0, 0.0, 0.38])
+    sweep(chart, person, eye)
+    assert chart.effort(np.array([1.8, 3.0, 4.7]), np.zeros(3)).tolist()[1:] == [1, 1]
+    assert chart.effort(1.8, 0.0) == 50
+    sweep(chart, lambda x, y: 0 * x, eye, times=20)
+    assert chart.effort(1.8, 0.0) == 50  # he may be behind something
+    sweep(chart, lambda x, y: 0 * x, eye, times=150)
+    assert chart.effort(1.8, 0.0) < 10
+
+
+def test_chart_remembers_a_wall_where_it_is_when_the_robot_goes_on():
+    chart = terrain.Chart()
+    sweep(chart, lambda x, y: np.where(x > 1.4, 1.0, 0.0), np.array([0.0, 0.0, 0.38]))
+    for x, y in ((-1.0, 0.7), (-2.3, -1.1)):
+        chart.draw(x, y, 0.0)
+        assert chart.effort(1.5, 0.0) == 50 and chart.effort(0.5, 0.0) == 1
