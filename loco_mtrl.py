@@ -640,7 +640,7 @@ class Guide(gymnasium.Wrapper):
 # ------------------------------------------------------------------------------- train
 
 REWARD_SCALE = 0.1  # keeps the critic's targets near 1
-MAIN_STEPS = 3_000_000  # of the no-argument run
+MAIN_STEPS = 2_000_000  # of the no-argument run
 SHORT_UNTIL = 200_000  # steps
 HARD = (0.4, 1.0)  # difficulties after that, when it knows how to walk
 # Layouts of an environment, at most, and how often the main part of a training makes them anew: the
