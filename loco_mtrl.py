@@ -600,7 +600,8 @@ def advise(env):
     Of all places in sight he turns to the one with the least sum of: the distance left from there
     to the goal; the effort of the straight way there (`Terrain.cost`); two metres for each second
     that the robot has lately spent around it, which drives him out of dead ends; and a metre for a
-    turn about. Returns an action, NaN for all but the two strides: (n_act,).
+    turn about. On a slope he crouches. Returns an action, NaN for all but the two strides and the
+    stance height: (n_act,).
     """
     advice = np.full(env.action.shape, np.nan)
     if env.exploded:
@@ -617,6 +618,8 @@ def advise(env):
     aside = 0.2 * min(max(1.2 * turn, -1.0), 1.0)
     strides = np.array([forward - aside, forward + aside])
     advice[1:3] = np.clip((strides - CENTRE[1:3]) / RANGE[1:3], -0.95, 0.95)
+    tilt = math.acos(min(env.up, 1.0))
+    advice[4] = -min(max(5 * (tilt - 0.1), 0.0), 0.95)
     return advice
 
 
@@ -624,8 +627,7 @@ class Guide(gymnasium.Wrapper):
     """Tells a robot in training the way: info["guide"] is what `advise` says.
 
     He is no part of the policy, only of what it learns from: to recognise, in what its own senses
-    tell, which way he would go. (n_act,), NaN for all but the two strides: the rest it finds out
-    for itself.
+    tell, which way he would go. The rest, NaN in his advice, it finds out for itself.
     """
 
     def reset(self, **kwargs):

@@ -27,7 +27,7 @@ PAD = 9  # pillars, depth of the flat strip at both ends where episodes start (1
 ROUTES = 8  # start and goal pairs per training terrain
 CHART = 0.2  # m, squares of the map that a robot draws
 DROP = 0.25  # m below the robot's feet from where on a ray has passed an edge
-FADE = 0.985  # of heights in that map, each time that it is drawn
+FADE = 0.8  # of heights in that map, each time that it is drawn
 TRIES = 20  # redraws before a generator is said to yield no route
 
 PERSON_RADIUS, PERSON_HEIGHT = 0.25, 1.7  # m, the body that an environment gives a Person

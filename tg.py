@@ -97,8 +97,9 @@ CENTRE, RANGE = np.array(list(PARAMETERS.values())).T
 PHASE_OFFSET = (0.0, math.pi, math.pi, 0.0)  # trot: diagonal legs move together
 DUTY = 0.5  # share of a stride that a foot stands: two feet are down at any time
 OUTWARD = 0.12  # m that feet stand outside their leg plane: a wide stance is what survives pushes
-_STANDING_FEET = np.array([[0.0, y, -CENTRE[4]] for y in LATERAL + SIDE * OUTWARD])
-STANDING = joint_angles(_STANDING_FEET)  # (12,) rad, all feet below their hips
+FORWARD = (0.11, 0.11, -0.05, -0.05)  # m that they stand ahead of their hips: a long one, slopes
+_STANDING_FEET = np.stack([FORWARD, LATERAL + SIDE * OUTWARD, [-CENTRE[4]] * 4], 1)
+STANDING = joint_angles(_STANDING_FEET)  # (12,) rad, the pose of a gait without strides
 
 
 class TrajectoryGenerator:
@@ -157,8 +158,8 @@ class TrajectoryGenerator:
     def _feet(self):
         _, left, right, lift, height = self.parameters
         feet = []
-        for offset, stride, lateral, side in zip(
-            PHASE_OFFSET, (right, left, right, left), _LATERAL, _SIDE, strict=True
+        for offset, stride, forward, lateral, side in zip(
+            PHASE_OFFSET, (right, left, right, left), FORWARD, _LATERAL, _SIDE, strict=True
         ):
             cycle = (self.phase + offset) / (2 * math.pi) % 1.0  # 0: touches down
             if cycle < DUTY:
@@ -166,7 +167,7 @@ class TrajectoryGenerator:
             else:
                 swing = (cycle - DUTY) / (1 - DUTY)
                 x, z = stride * (swing - 0.5), lift * math.sin(math.pi * swing) - height
-            feet.append((x, lateral + side * OUTWARD, z))
+            feet.append((forward + x, lateral + side * OUTWARD, z))
         return feet
 
     def state(self):

@@ -290,7 +290,7 @@ def test_the_guide_leads_around_a_wall():
         goal, terminated = env.unwrapped.terrain.goals[0], False
         assert (env.unwrapped.position[0] < 6) != (goal[0] < 6)  # the wall is between them
         while not terminated and env.unwrapped.time < 30:
-            assert np.isnan(info["guide"][[0, *range(3, 17)]]).all()
+            assert np.isnan(info["guide"][[0, 3, *range(5, 17)]]).all()
             assert np.abs(info["guide"][1:3]).max() <= 0.95
             _, _, terminated, _, info = env.step(np.nan_to_num(info["guide"]))
         assert info["success"]
@@ -308,7 +308,7 @@ def test_the_guide_reaches_the_goal_of_a_world(world):
     (["--sequential", "--tasks", "flat,walls"], [1.0, 1.0]),
 ])
 def test_who_learns_from_the_guide(arguments, shares):
-    """Strides are all he can teach; the paper knows no guide."""
+    """Strides and crouching are all he can teach; the paper knows no guide."""
     stages = loco_mtrl.plan(loco_mtrl.parse(["train", *arguments]))
     assert [settings.get("guide_share", 0.0) for *_, settings in stages] == shares
     assert stages[-1][2] == 1.0
@@ -342,6 +342,14 @@ def test_the_guide_does_not_stay_where_he_has_been_for_long():
             env.trail = [place_of_late] * 15
             left, right = loco_mtrl.advise(env)[1:3]
             assert abs(right - left) > 1.0 if turns else right == left > 0
+
+
+@pytest.mark.parametrize(("roll", "crouch"), [(0.0, 0), (0.2, -0.5), (-0.2, -0.5), (0.5, -0.95)])
+def test_the_guide_crouches_on_slopes(plane, roll, crouch):
+    """Five times what the tilt exceeds 0.1 rad, whichever way it goes."""
+    plane.reset(seed=0)
+    place(plane, 3.0, 0.0, 0.4, roll=roll)
+    assert loco_mtrl.advise(plane)[4] == pytest.approx(crouch, abs=1e-6)
 
 
 def test_time_around_by_hand(plane):

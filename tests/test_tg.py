@@ -53,9 +53,9 @@ def test_a_pose_by_hand():
     assert feet[1, 1] == pytest.approx(0.035165)
 
 
-def test_standing_feet_are_below_their_hips():
+def test_standing_feet_are_spread_about_their_hips():
     feet = tg.foot_position(tg.STANDING)
-    np.testing.assert_allclose(feet[:, 0], 0, atol=1e-12)
+    np.testing.assert_allclose(feet[:, 0], [0.11, 0.11, -0.05, -0.05])
     np.testing.assert_allclose(feet[:, 1], tg.LATERAL + tg.SIDE * 0.12)
     np.testing.assert_allclose(feet[:, 2], -0.25)
 
@@ -101,14 +101,16 @@ def test_stance_slides_back_and_swing_lifts():
     generator = tg.TrajectoryGenerator()
     generator.reset(0.0)  # FR and RL touch down, the others take off
     feet = generator.feet()
-    np.testing.assert_allclose(feet[:, 0], [0.065, -0.065, -0.065, 0.065])  # half of 0.13 m
+    spread = np.array([0.11, 0.11, -0.05, -0.05])
+    # half of 0.13 m ahead of where they stand, or behind
+    np.testing.assert_allclose(feet[:, 0] - spread, [0.065, -0.065, -0.065, 0.065])
     np.testing.assert_allclose(feet[:, 2], -0.25)
     generator.reset(2 * np.pi * 0.75)  # FR is half through its swing, FL half through its stance
     feet = generator.feet()
-    assert feet[0] == pytest.approx([0.0, tg.LATERAL[0] - 0.12, -0.25 + 0.26])
-    assert feet[1] == pytest.approx([0.0, tg.LATERAL[1] + 0.12, -0.25])
+    assert feet[0] == pytest.approx([0.11, tg.LATERAL[0] - 0.12, -0.25 + 0.26])
+    assert feet[1] == pytest.approx([0.11, tg.LATERAL[1] + 0.12, -0.25])
     generator.reset(2 * np.pi * 0.1)  # a fifth of the stance of FR is over
-    assert generator.feet()[0, 0] == pytest.approx(0.065 - 0.13 / 5)
+    assert generator.feet()[0, 0] == pytest.approx(0.11 + 0.065 - 0.13 / 5)
 
 
 @settings(max_examples=50, deadline=None)
