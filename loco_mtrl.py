@@ -147,27 +147,31 @@ def lidar_rays():
     return np.where(directions[:, :1] > 0, LIDAR_FRONT, LIDAR_REAR), directions
 
 
-# Memory: how many of the last MEMORY seconds were spent within a metre of each of these points (m,
-# in the base frame), the nearer the more. A near and a far row of them, along the scan's columns.
-MEMORY, MEMORY_RADII = 40, (0.7, 2.0)
-_LEFTWARD = np.radians(LIDAR_AZIMUTHS[0])
-_AROUND = np.stack([np.cos(_LEFTWARD), np.sin(_LEFTWARD)], 1)
-MEMORY_POINTS = np.concatenate([radius * _AROUND for radius in MEMORY_RADII])  # (48, 2)
-
-# The chart: a map that the robot draws as it goes (terrain.Chart), told as the effort of going as
-# far as these (m) along each column. It is drawn anew every CHART_EVERY control steps.
+# The chart: a map that the robot draws as it goes (terrain.Chart), drawn anew every CHART_EVERY
+# control steps. Along each column of the scan it is told the effort of going as far as CHART_RADII
+# (m), and what the best place on that line would cost in all: see `weigh_ways`.
 CHART_RADII, CHART_EVERY = (0.6, 1.5, 2.7, 4.5), 10
-_PACES = np.arange(0.3, 4.6, 0.3)  # m, the points of a straight way whose costs are summed
+MEMORY = 40  # s, for how long the robot remembers where it has been
+_LINES = np.radians(LIDAR_AZIMUTHS[0])
+_PACES = np.arange(0.3, 4.6, 0.3)  # m, the places on a line
 _CHARTED = np.isin(np.round(_PACES, 1), CHART_RADII)
 
 
-def way_effort(effort, x, y, angles):
-    """Effort of straight ways from x, y (m) along `angles` (rad, (A,)) to each of _PACES: (15, A).
+def weigh_ways(env, effort):
+    """What it would take to go straight along each of the scan's columns, to each of _PACES.
 
-    `effort` as in Terrain.effort; a metre in the open counts 0.4. Returns the points' x, y, too.
+    effort(x, y): what a metre costs there, as in Terrain.effort, but in Bullet's frame.
+    Returns two arrays (15, 24) in metres: the effort of the way, a metre in the open counts 0.4;
+    and the whole cost: that effort, the distance left from there to the goal, two metres for each
+    second lately spent around there, which drives a robot out of dead ends, and up to one metre
+    for the turn.
     """
-    px, py = x + _PACES[:, None] * np.cos(angles), y + _PACES[:, None] * np.sin(angles)
-    return 0.12 * effort(px, py).cumsum(0), px, py  # 0.3 m a step
+    x, y, _ = env.position
+    angles, paces = env.yaw + _LINES, _PACES[:, None]
+    px, py = x + paces * np.cos(angles), y + paces * np.sin(angles)
+    way = 0.12 * effort(px, py).cumsum(0)  # 0.3 m a pace
+    left = np.hypot(px - env.goal[0], py - env.goal[1])
+    return way, way + left + 2 * env.time_around(px, py) + np.abs(_LINES) / np.pi
 
 
 # ------------------------------------------------------------------------------- the environment
@@ -204,12 +208,12 @@ def _about_z(yaw):
 class LocoEnv(gymnasium.Env):
     """A Laikago walks to a goal over terrain that only its LiDAR shows it (section 2).
 
-    ## Observation: Box((428,), float32), in the order of section 2.1
+    ## Observation: Box((404,), float32), in the order of section 2.1
     | entries | meaning | unit |
     |---|---|---|
     | 240 | r, LiDAR scan: sqrt(distance / 5 m), 1: no hit; rows from low to high, left to right | |
-    | 48 | memory: time spent lately 0.7 m and 2 m away along each column, log scale; ours | |
     | 96 | chart: effort of 0.6, 1.5, 2.7, 4.5 m along each column in the robot's own map; ours | |
+    | 24 | what going each column's way would cost in all, less the cheapest: `weigh_ways`; ours | |
     | 1 | g_d, distance to the goal | m |
     | 1 | g_h, heading of the goal relative to the robot's, left positive | rad |
     | 3 | angular rates of the base in its own frame (IMU) | rad/s |
@@ -217,8 +221,8 @@ class LocoEnv(gymnasium.Env):
     | 12 | q, joint angles: FR, FL, RR, RL x abduction, hip, knee | rad |
     | 12 | a_{t-1}, joint targets commanded in the previous step | rad |
     | 13 | s_tg, state of the trajectory generator; none with tg=False | |
-    The paper's robot knows neither its tilt nor where it has been: paper=True leaves both out, and
-    lidar=False the scan. Scan and memory are taken at 15 Hz, all else at 30 Hz.
+    The paper's robot knows neither its tilt nor where it has been: paper=True leaves chart, ways
+    and tilt out, and lidar=False all that is seen. That is taken at 15 Hz, all else at 30 Hz.
 
     ## Action: Box(-1, 1, (17,), float32), clipped to that range, then smoothed
     5 parameters of the trajectory generator (`tg.PARAMETERS`), then the 12 residuals u_fb;
@@ -242,7 +246,7 @@ class LocoEnv(gymnasium.Env):
             of these; None: all pillar tasks. Each episode draws one; the policy is not told which.
         difficulty: in [0, 1], or (low, high) to draw it from, once for each terrain.
         tg, lidar: the paper's ablations (section 3) leave one of them out.
-        paper: the paper's own state and reward: no memory, no tilt, no cost of a fall.
+        paper: the paper's own state and reward: no chart, no tilt, no cost of a fall.
         terrains: how many terrains of each task to build; Bullet never frees a mesh, so the pool
             is built once and episodes draw from it. A finished Terrain counts once.
         pool_seed: seeds the pool; `reset(seed=...)` seeds all else.
@@ -275,8 +279,8 @@ class LocoEnv(gymnasium.Env):
         self.generator = TrajectoryGenerator() if tg else None
         self._connect(gui)
         rows, columns = LIDAR_AZIMUTHS.shape
-        rows = rows * lidar + len(MEMORY_RADII) * (not paper)
-        self.scan_shape = rows + len(CHART_RADII) * (lidar and not paper), columns
+        charted = len(CHART_RADII) + 1 if lidar and not paper else 0
+        self.scan_shape = rows * lidar + charted, columns
         self.lidar, self.paper = lidar, paper
         n_scan = math.prod(self.scan_shape)
         self.scan = np.zeros(n_scan, np.float32)
@@ -486,6 +490,8 @@ class LocoEnv(gymnasium.Env):
         state += self.target.tolist()
         if self.generator:
             state += self.generator.state()
+        if self.time >= len(self.trail):  # one place a second
+            self.trail.append(position[:2])
         observation = np.empty(self.observation_space.shape, dtype=np.float32)
         observation[self.scan.size :] = state
         if turn_lidar and self.lidar:
@@ -494,34 +500,22 @@ class LocoEnv(gymnasium.Env):
             # The root: as fine as a scan of 3 m is near by, and yet it looks across a room.
             fractions = np.fromiter(map(HIT_FRACTION, self.hits), np.float32, N_RAYS)
             self.scan[:N_RAYS] = np.sqrt(fractions)
-        if turn_lidar and not self.paper:
-            first = N_RAYS * self.lidar
-            self.scan[first : first + len(MEMORY_POINTS)] = self._been_there(r)
-            if self.lidar:
-                self.scan[first + len(MEMORY_POINTS) :] = self._draw_chart(r, fractions)
+            if not self.paper:
+                self.scan[N_RAYS:] = self._draw_chart(r, fractions)
         observation[: self.scan.size] = self.scan
         return observation
 
     def _draw_chart(self, r, fractions):
-        """Enters a scan into the chart, and tells its effort along each column, on a log scale."""
+        """Enters a scan into the chart; what that says of each column's way, on a log scale."""
         turn, (x, y, z) = np.reshape(r, (3, 3)).T, self.position
         eyes = self._eyes @ turn + self.position
         hits = eyes + fractions[:, None] * (self._reach @ turn)
         self.chart.see(eyes, hits, fractions < 1, z - BASE_HEIGHT)
         if self.steps % CHART_EVERY == 0:
             self.chart.draw(x, y, z - BASE_HEIGHT)
-        effort, _, _ = way_effort(self.chart.effort, x, y, self.yaw + _LEFTWARD)
-        return (np.log1p(effort[_CHARTED]) / math.log1p(90)).ravel()  # 90: all the way in a wall
-
-    def _been_there(self, r):
-        """Memory: time spent around each of MEMORY_POINTS, on a log scale; `r`: base to world."""
-        x, y, _ = self.position
-        if self.time >= len(self.trail):  # one place a second
-            self.trail.append((x, y))
-        size = math.hypot(r[0], r[3])
-        forward, left = (r[0] / size, r[3] / size), (-r[3] / size, r[0] / size)
-        seconds = self.time_around(*(MEMORY_POINTS @ (forward, left) + (x, y)).T)
-        return np.log1p(seconds) / math.log1p(MEMORY)
+        way, whole = weigh_ways(self, self.chart.effort)
+        costs = np.vstack([way[_CHARTED], whole.min(0) - whole.min()])
+        return (np.log1p(costs) / math.log1p(90)).ravel()  # 90: all the way in a wall
 
     def time_around(self, x, y):
         """Seconds of the last MEMORY spent within a metre of x, y (m, arrays), the nearer the more.
@@ -591,17 +585,13 @@ if "LocoMTRL-v0" not in gymnasium.registry:  # run as a script, this file is imp
 # ------------------------------------------------------------------------------- the guide
 
 PACE = 0.21  # m, the guide's stride where his way is straight
-_LINES = np.radians(np.arange(-180, 180, 10))  # where he looks: all around, from straight ahead
 
 
 def advise(env):
     """What a guide would do who knows the ground around him, as far as the robot could see it.
 
-    Of all places in sight he turns to the one with the least sum of: the distance left from there
-    to the goal; the effort of the straight way there (`Terrain.cost`); two metres for each second
-    that the robot has lately spent around it, which drives him out of dead ends; and a metre for a
-    turn about. On a slope he crouches. Returns an action, NaN for all but the two strides and the
-    stance height: (n_act,).
+    He takes the cheapest of the ways that `weigh_ways` weighs, over the true ground, and crouches on
+    a slope. Returns an action, NaN for all but the two strides and the stance height: (n_act,).
     """
     advice = np.full(env.action.shape, np.nan)
     if env.exploded:
@@ -609,10 +599,8 @@ def advise(env):
     (x, y, _), (to_x, to_y, _) = np.subtract((env.position, env.goal), env.origin)
     turn = math.remainder(math.atan2(to_y - y, to_x - x) - env.yaw, 2 * math.pi)
     if env.distance > 0.7:
-        effort, px, py = way_effort(env.terrain.effort, x, y, env.yaw + _LINES)
-        total = np.hypot(px - to_x, py - to_y) + effort + np.abs(_LINES) / np.pi
-        total += 2 * env.time_around(px + env.origin[0], py)
-        turn = _LINES[total.min(0).argmin()]
+        _, whole = weigh_ways(env, lambda x, y: env.terrain.effort(x - env.origin[0], y))
+        turn = _LINES[whole.min(0).argmin()]
     # The strides: slower in a bend, on the spot where the way lies to the side or behind.
     forward = PACE * max(0.0, math.cos(turn)) ** 2
     aside = 0.2 * min(max(1.2 * turn, -1.0), 1.0)
@@ -642,7 +630,7 @@ class Guide(gymnasium.Wrapper):
 # ------------------------------------------------------------------------------- train
 
 REWARD_SCALE = 0.1  # keeps the critic's targets near 1
-MAIN_STEPS = 2_000_000  # of the no-argument run
+MAIN_STEPS = 1_200_000  # of the no-argument run
 SHORT_UNTIL = 200_000  # steps
 HARD = (0.4, 1.0)  # difficulties after that, when it knows how to walk
 # Layouts of an environment, at most, and how often the main part of a training makes them anew: the

@@ -25,8 +25,8 @@ STEP = 0.2  # m, highest step that they clear at all: what training may ask for
 FLAT = 0.05  # m, most that the ground under a start may vary
 PAD = 9  # pillars, depth of the flat strip at both ends where episodes start (1.8 m)
 ROUTES = 8  # start and goal pairs per training terrain
-CHART = 0.2  # m, squares of the map that a robot draws
-DROP = 0.25  # m below the robot's feet from where on a ray has passed an edge
+CHART = 0.1  # m, squares of the map that a robot draws
+DROP = 0.21  # m below the robot's feet from where on a ray has passed an edge
 FADE = 0.8  # of heights in that map, each time that it is drawn
 TRIES = 20  # redraws before a generator is said to yield no route
 
@@ -308,7 +308,7 @@ class Chart:
     gone over them to something lower. The map is a torus of 51 m: it has no border, and needs none.
     """
 
-    size, half = 256, 24  # squares: of all the map, and from the robot to what is looked at
+    size, half = 512, 48  # squares: of all the map, and from the robot to what is looked at
 
     def __init__(self):
         self.low, self.high, self.below = np.full((3, self.size**2), np.nan, np.float32)
@@ -346,8 +346,9 @@ class Chart:
             step, odd = np.abs(z[one] - z[other]) > STEP, off[one] > off[other]
             edge[one] |= step & odd
             edge[other] |= step & ~odd
-        edge |= np.isnan(z) & (_window(z, 2, np.fmax) - below > STEP)
-        self.cost = _cost(z, ~_window(edge, 1, np.maximum), CHART)
+        gone = np.isnan(z) & (_window(z, 4, np.fmax) - below > STEP)
+        edge |= _window(gone, 1, np.maximum)  # the brink is nearer than where it shows
+        self.cost = _cost(z, ~_window(edge, 2, np.maximum), CHART)
 
     def effort(self, x, y):
         """As Terrain.effort, as far as is known; the unknown is open ground."""
