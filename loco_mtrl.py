@@ -590,8 +590,8 @@ PACE = 0.21  # m, the guide's stride where his way is straight
 def advise(env):
     """What a guide would do who knows the ground around him, as far as the robot could see it.
 
-    He takes the cheapest of the ways that `weigh_ways` weighs, over the true ground, and crouches on
-    a slope. Returns an action, NaN for all but the two strides and the stance height: (n_act,).
+    He takes the cheapest of the ways that `weigh_ways` weighs, over the true ground, and crouches
+    on a slope. Returns an action, NaN for all but two strides and the stance height: (n_act,).
     """
     advice = np.full(env.action.shape, np.nan)
     if env.exploded:
