@@ -151,7 +151,6 @@ def lidar_rays():
 # control steps. Along each column of the scan it is told the effort of going as far as CHART_RADII
 # (m), and what the best place on that line would cost in all: see `weigh_ways`.
 CHART_RADII, CHART_EVERY = (0.6, 1.5, 2.7, 4.5), 10
-MEMORY = 40  # s, for how long the robot remembers where it has been
 _LINES = np.radians(LIDAR_AZIMUTHS[0])
 _PACES = np.arange(0.3, 4.6, 0.3)  # m, the places on a line
 _CHARTED = np.isin(np.round(_PACES, 1), CHART_RADII)
@@ -161,17 +160,15 @@ def weigh_ways(env, effort):
     """What it would take to go straight along each of the scan's columns, to each of _PACES.
 
     effort(x, y): what a metre costs there, as in Terrain.effort, but in Bullet's frame.
-    Returns two arrays (15, 24) in metres: the effort of the way, a metre in the open counts 0.4;
-    and the whole cost: that effort, the distance left from there to the goal, two metres for each
-    second lately spent around there, which drives a robot out of dead ends, and up to one metre
-    for the turn.
+    Returns two arrays (15, 24), in metres of open ground: the effort of the way; and the whole
+    cost: that effort, what is left from there to the goal in the robot's own chart, and up to
+    0.3 m for the turn.
     """
     x, y, _ = env.position
     angles, paces = env.yaw + _LINES, _PACES[:, None]
     px, py = x + paces * np.cos(angles), y + paces * np.sin(angles)
-    way = 0.12 * effort(px, py).cumsum(0)  # 0.3 m a pace
-    left = np.hypot(px - env.goal[0], py - env.goal[1])
-    return way, way + left + 2 * env.time_around(px, py) + np.abs(_LINES) / np.pi
+    way = 0.3 * effort(px, py).cumsum(0)
+    return way, way + env.chart.to_go(px, py) + 0.3 * np.abs(_LINES) / np.pi
 
 
 # ------------------------------------------------------------------------------- the environment
@@ -408,8 +405,8 @@ class LocoEnv(gymnasium.Env):
         p.resetBaseVelocity(self.robot, [0, 0, 0], [0, 0, 0])
         for joint, angle in zip(self.joints, self.target, strict=True):
             p.resetJointState(self.robot, joint, angle)
-        self.time, self.steps, self.collisions, self.trail = 0.0, 0, 0, []
-        self.chart = Chart()
+        self.time, self.steps, self.collisions = 0.0, 0, 0
+        self.chart = Chart(*position[:2], self.goal)
         self.touching = self.exploded = False
         for body in self.people:  # not all terrains have as many
             p.resetBasePositionAndOrientation(body, (0, 0, -1000), (0, 0, 0, 1))
@@ -490,11 +487,9 @@ class LocoEnv(gymnasium.Env):
         state += self.target.tolist()
         if self.generator:
             state += self.generator.state()
-        if self.time >= len(self.trail):  # one place a second
-            self.trail.append(position[:2])
         observation = np.empty(self.observation_space.shape, dtype=np.float32)
         observation[self.scan.size :] = state
-        if turn_lidar and self.lidar:
+        if turn_lidar and self.lidar and math.isfinite(self.distance):
             self.hits = p.rayTestBatch(*self._rays, parentObjectUniqueId=self.robot,
                                        parentLinkIndex=-1, collisionFilterMask=STATIC_GROUP)
             # The root: as fine as a scan of 3 m is near by, and yet it looks across a room.
@@ -514,17 +509,9 @@ class LocoEnv(gymnasium.Env):
         if self.steps % CHART_EVERY == 0:
             self.chart.draw(x, y, z - BASE_HEIGHT)
         way, whole = weigh_ways(self, self.chart.effort)
-        costs = np.vstack([way[_CHARTED], whole.min(0) - whole.min()])
-        return (np.log1p(costs) / math.log1p(90)).ravel()  # 90: all the way in a wall
-
-    def time_around(self, x, y):
-        """Seconds of the last MEMORY spent within a metre of x, y (m, arrays), the nearer the more.
-
-        x, y are in Bullet's frame, as `position` is.
-        """
-        xs, ys = np.array(self.trail[-MEMORY:]).T
-        dx, dy = x[..., None] - xs, y[..., None] - ys  # (..., places) each
-        return np.maximum(1 - dx * dx - dy * dy, 0).sum(-1)
+        whole = whole[1:].min(0)
+        costs = np.vstack([way[_CHARTED], whole - whole.min()])
+        return (np.log1p(costs) / math.log1p(225)).ravel()  # 225: all the way in a wall
 
     def render(self):
         """The robot from above and behind, as uint8 (300, 400, 3)."""
@@ -600,7 +587,7 @@ def advise(env):
     turn = math.remainder(math.atan2(to_y - y, to_x - x) - env.yaw, 2 * math.pi)
     if env.distance > 0.7:
         _, whole = weigh_ways(env, lambda x, y: env.terrain.effort(x - env.origin[0], y))
-        turn = _LINES[whole.min(0).argmin()]
+        turn = _LINES[whole[1:].min(0).argmin()]
     # The strides: slower in a bend, on the spot where the way lies to the side or behind.
     forward = PACE * max(0.0, math.cos(turn)) ** 2
     aside = 0.2 * min(max(1.2 * turn, -1.0), 1.0)
@@ -630,7 +617,7 @@ class Guide(gymnasium.Wrapper):
 # ------------------------------------------------------------------------------- train
 
 REWARD_SCALE = 0.1  # keeps the critic's targets near 1
-MAIN_STEPS = 1_200_000  # of the no-argument run
+MAIN_STEPS = 800_000  # of the no-argument run
 SHORT_UNTIL = 200_000  # steps
 HARD = (0.4, 1.0)  # difficulties after that, when it knows how to walk
 # Layouts of an environment, at most, and how often the main part of a training makes them anew: the

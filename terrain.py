@@ -305,23 +305,40 @@ class Chart:
     """What a robot has seen of the ground, a map that it draws itself from its LiDAR's hits.
 
     Squares of CHART m a side know the lowest and the highest hit in them, and whether a ray has
-    gone over them to something lower. The map is a torus of 51 m: it has no border, and needs none.
+    gone over them to something lower. Larger ones of 2 x 2 know what is `left` from there to the
+    goal: the length of the way, a metre counted as in `Terrain.cost`. What is not seen yet is open
+    ground; so at first that is the straight distance, and it grows as walls are found.
+
+    The map is 32 m wide, around x, y (m), where the robot starts. goal: x, y, ... in m.
     """
 
-    size, half = 512, 48  # squares: of all the map, and from the robot to what is looked at
+    size, half = 320, 48  # squares: of all the map, and from the robot to what is looked at
+    rounds = 12  # of value iteration, each time that the map is drawn
 
-    def __init__(self):
+    def __init__(self, x, y, goal):
+        self.corner = np.floor(np.array([x, y]) / CHART).astype(int) - self.size // 2
         self.low, self.high, self.below = np.full((3, self.size**2), np.nan, np.float32)
+        self.cost = np.ones((self.size, self.size), np.float32)
+        at = (2 * np.arange(self.size // 2)[:, None] + self.corner + 1) * CHART
+        self.left = np.hypot(at[:, :1] - goal[0], at[:, 1] - goal[1]).astype(np.float32)
+        self.goal = tuple(k // 2 for k in self._squares(*goal[:2]))
+        self.least = self.left[self.goal]  # 0, but for a goal beyond the map
+
+    def _squares(self, x, y):
+        i, j = (np.floor(c / CHART).astype(int) - low
+                for c, low in zip((x, y), self.corner, strict=True))
+        return i.clip(0, self.size - 1), j.clip(0, self.size - 1)
 
     def _at(self, points):
-        i, j = np.floor(points[:, :2].T / CHART).astype(int) % self.size
+        i, j = self._squares(*points[:, :2].T)
         return i * self.size + j
 
     def see(self, eyes, hits, hit, ground):
         """Enters a scan: rays from `eyes` to `hits` (R, 3) m, where they end by a `hit` (R,) or in
         the air; `ground`: m, the height on which the robot stands.
         """
-        ends = hits[hit]
+        # A little further: what is hit lies behind its surface, in the square there.
+        ends = hits[hit] + 0.002 * (hits - eyes)[hit]
         at, z = self._at(ends), ends[:, 2].astype(np.float32)
         np.fmin.at(self.low, at, z)
         np.fmax.at(self.high, at, z)
@@ -333,14 +350,18 @@ class Chart:
         np.fmin.at(self.below, self._at(a + part[:, None] * (b - a)), level)
 
     def draw(self, x, y, ground):
-        """Works out `effort` anew around x, y (m), as far as 4.8 m away; `ground` as in `see`."""
-        self.corner = [math.floor(c / CHART) - self.half for c in (x, y)]
-        i, j = ((c + np.arange(2 * self.half + 1)) % self.size for c in self.corner)
-        at = i[:, None] * self.size + j
-        low, high, below = self.low[at], self.high[at], self.below[at]
-        self.high[at] = low + FADE * (high - low)  # people shall leave no walls behind
+        """Works out anew what a metre costs, and what is left from where, up to 4.8 m around x, y.
+
+        `ground` as in `see`.
+        """
+        i, j = (2 * (int(c) // 2) for c in self._squares(x, y))  # of a larger square's corner
+        here = (slice(max(i - self.half, 0), i + self.half),
+                slice(max(j - self.half, 0), j + self.half))
+        low, high, below = (a.reshape(self.cost.shape)[here]
+                            for a in (self.low, self.high, self.below))
         z = (low + high) / 2  # NaN: not seen yet
         edge = high - low > STEP
+        high[:] = low + FADE * (high - low)  # people shall leave no walls behind
         off = np.abs(z - ground)  # of two squares with a step between, the odd one is in the way
         for one, other in ((np.s_[1:], np.s_[:-1]), (np.s_[:, 1:], np.s_[:, :-1])):
             step, odd = np.abs(z[one] - z[other]) > STEP, off[one] > off[other]
@@ -348,13 +369,32 @@ class Chart:
             edge[other] |= step & ~odd
         gone = np.isnan(z) & (_window(z, 4, np.fmax) - below > STEP)
         edge |= _window(gone, 1, np.maximum)  # the brink is nearer than where it shows
-        self.cost = _cost(z, ~_window(edge, 2, np.maximum), CHART)
+        self.cost[here] = cost = _cost(z, ~_window(edge, 2, np.maximum), CHART)
+
+        # Value iteration: what is left from a square is a step and what is left from where it ends.
+        nx, ny = np.array(cost.shape) // 2
+        cost = cost.reshape(nx, 2, ny, 2).min((1, 3))
+        left = self.left[tuple(slice(k.start // 2, k.stop // 2) for k in here)]  # a view
+        inner, steps = np.s_[1:-1, 1:-1], []
+        for a, b in ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1)):
+            there = np.s_[1 + a : nx - 1 + a, 1 + b : ny - 1 + b]
+            steps.append((there, CHART * math.hypot(a, b) * (cost[there] + cost[inner])))
+        for _ in range(self.rounds):
+            left[inner] = np.minimum.reduce([left[there] + step for there, step in steps])
+            self.left[self.goal] = self.least
 
     def effort(self, x, y):
         """As Terrain.effort, as far as is known; the unknown is open ground."""
-        i, j = (np.floor(c / CHART).astype(int) - low
+        return self.cost[self._squares(x, y)]
+
+    def to_go(self, x, y):
+        """What is left from x, y (m, arrays) to the goal, in metres of open ground."""
+        u, v = (np.clip((c / CHART - low) / 2 - 0.5, 0, self.size / 2 - 1.001)
                 for c, low in zip((x, y), self.corner, strict=True))
-        return self.cost[i.clip(0, 2 * self.half), j.clip(0, 2 * self.half)]
+        i, j = u.astype(int), v.astype(int)
+        f, g, left = u - i, v - j, self.left
+        return ((1 - f) * ((1 - g) * left[i, j] + g * left[i, j + 1])
+                + f * ((1 - g) * left[i + 1, j] + g * left[i + 1, j + 1]))
 
 
 # ---------------------------------------------------------------- the training tasks
