@@ -222,52 +222,45 @@ def test_the_scan_is_taken_every_other_step(flat):
 
 
 def test_ways_are_weighed_as_defined(flat):
-    """Against the definition, place by place, for a robot that came along an L over open ground."""
+    """Against the definition, place by place; on open ground what is left is the distance."""
     flat.reset(seed=0)
     place(flat, 6.0, 1.0, 0.3, yaw=2.0)
-    trail = [(4 + 0.2 * k, 0.0) for k in range(30)] + [(6.0, 0.1 * k) for k in range(20)]
-    flat.trail = [(flat.origin[0] + x, y) for x, y in trail]
     goal = np.subtract(flat.goal, flat.origin)
-    whole = []
-    for azimuth in np.radians(loco_mtrl.LIDAR_AZIMUTHS[0]):
-        sums = []
-        for far in 0.3 * np.arange(1, 16):
+    flat.chart = terrain.Chart(*flat.position[:2], flat.goal)
+    way, whole = loco_mtrl.weigh_ways(flat, lambda x, y: np.full_like(x, 2.0))
+    for k, azimuth in enumerate(np.radians(loco_mtrl.LIDAR_AZIMUTHS[0])):
+        for row, far in enumerate(0.3 * np.arange(1, 16)):
             x, y = 6 + far * np.cos(2 + azimuth), 1 + far * np.sin(2 + azimuth)
-            square = [(x - a) ** 2 + (y - b) ** 2 for a, b in trail[-loco_mtrl.MEMORY :]]
-            seconds = sum(max(1 - s, 0) for s in square)
             left = math.hypot(x - goal[0], y - goal[1])
-            sums.append(0.4 * far + left + 2 * seconds + abs(azimuth) / np.pi)
-        whole.append(min(sums))
-    told = flat._observe()[N_RAYS + N_CHART : N_SCAN]
-    more = np.array(whole) - min(whole)
-    np.testing.assert_allclose(told, np.log1p(more) / math.log(91), atol=1e-5)
-    assert told.min() == 0 and told.max() > 0.3
+            assert way[row, k] == pytest.approx(2 * far)
+            total = 2 * far + left + 0.3 * abs(azimuth) / np.pi
+            assert whole[row, k] == pytest.approx(total, abs=0.1)  # between squares of 0.2 m
 
 
-def test_the_trail_has_a_place_a_second_and_ends_with_the_episode(flat):
-    flat.reset(seed=0)
-    assert len(flat.trail) == 1
-    for _ in range(95):
-        flat.step(np.zeros(17))
-    assert len(flat.trail) == 4  # after 0, 1, 2 and 3 s
-    flat.reset()
-    assert flat.trail == [pytest.approx(flat.position[:2])]
+def test_ways_are_told_less_the_cheapest(flat):
+    observation, _ = flat.reset(seed=0)
+    told = observation[N_RAYS + N_CHART : N_SCAN]
+    _, whole = loco_mtrl.weigh_ways(flat, flat.chart.effort)
+    whole = whole[1:].min(0)  # from 0.6 m on
+    np.testing.assert_allclose(np.expm1(told * math.log(226)), whole - whole.min(), atol=1e-4)
+    assert told.min() == 0 and told.max() > 0.1
 
 
 def test_chart_shows_the_wall_that_the_lidar_has_seen_and_the_way_around_it():
-    """By hand: a pace of 0.3 m in the open costs 0.12, and 50 times that in the wall's front."""
+    """By hand: a metre in the open counts as one, and 50 times that in the wall's front."""
     with closing(LocoEnv(wall_ahead)) as env:
         env.reset(seed=0)
         place(env, 4.6, -1.0, 0.3)
-        env.chart = terrain.Chart()  # as if it had only just come there
-        chart = np.expm1(env._observe()[N_RAYS : N_RAYS + N_CHART].reshape(4, 24) * math.log(91))
+        x, y, _ = env.position
+        env.chart = terrain.Chart(x, y, env.goal)  # as if it had only just come there
+        chart = np.expm1(env._observe()[N_RAYS : N_RAYS + N_CHART].reshape(4, 24) * math.log(226))
         ahead = np.abs(loco_mtrl.LIDAR_AZIMUTHS[0]) < 15
-        np.testing.assert_allclose(chart[0], 0.24, atol=1e-4)  # 0.6 m on, all around
-        assert chart[2, ahead].min() > 12
-        np.testing.assert_allclose(chart[:, 0], 0.12 * np.array([2, 5, 9, 15]), atol=1e-4)  # behind
+        np.testing.assert_allclose(chart[0], 0.6, atol=1e-4)  # 0.6 m on, all around
+        assert chart[2, ahead].min() > 15
+        np.testing.assert_allclose(chart[:, 0], [0.6, 1.5, 2.7, 4.5], atol=1e-4)  # behind
         place(env, 4.6, -1.0, 0.3, yaw=math.pi)  # it has turned, and knows what is behind it
-        chart = np.expm1(env._observe()[N_RAYS : N_RAYS + N_CHART].reshape(4, 24) * math.log(91))
-        assert chart[2, [0, -1]].min() > 12 and chart[2, ahead].max() < 2
+        chart = np.expm1(env._observe()[N_RAYS : N_RAYS + N_CHART].reshape(4, 24) * math.log(226))
+        assert chart[2, [0, -1]].min() > 15 and chart[2, ahead].max() < 5
         env.reset()
         assert np.isnan(env.chart.low).sum() > env.chart.low.size - 300  # a new episode, a new map
 
@@ -338,17 +331,22 @@ def test_the_guide_turns_to_the_goal(yaw, turns):
         assert (left + right) / 2 == pytest.approx(0.21 * max(0, math.cos(yaw)) ** 2, abs=0.05)
 
 
-def test_the_guide_does_not_stay_where_he_has_been_for_long():
-    """Before a wall with the goal behind it: at first he goes up to it, later he turns away."""
-    with closing(LocoEnv(wall_ahead)) as env:
-        env.reset(seed=0)
-        env.goal = (env.origin + [9.0, -1.0, 0.3]).tolist()
-        place(env, 5.2, -1.0, 0.35)
-        here, elsewhere = tuple(env.position[:2]), (99.0, 99.0)
-        for place_of_late, turns in ((elsewhere, False), (here, True)):
-            env.trail = [place_of_late] * 15
-            left, right = loco_mtrl.advise(env)[1:3]
-            assert abs(right - left) > 1.0 if turns else abs(right - left) < 0.2 < left
+def test_the_guide_walks_out_of_a_dead_end():
+    """A pocket 3 m deep, its back to the goal: he has to walk away from the goal first."""
+    def pocket(rng, difficulty):
+        heights = np.zeros(SHAPE)
+        heights[40, 10:30] = heights[25:40, [10, 29]] = 1.0
+        return heights
+
+    ground = terrain.make_terrain(pocket, np.random.default_rng(0), 1.0)
+    ground.starts[0], ground.goals[0] = (7.0, 0, 0, 0), (10.0, 0, 0)
+    with closing(LocoEnv(ground)) as env:
+        env.reset(seed=0, options={"route": 0})
+        x = []
+        while env.time < 40 and env.distance > 0.5:
+            x.append(env.position[0] - env.origin[0])
+            env.step(np.nan_to_num(loco_mtrl.advise(env)))
+        assert env.distance < 0.5 and min(x) < 5.0 < max(x)
 
 
 @pytest.mark.parametrize(("roll", "crouch"), [(0.0, 0), (0.2, -0.5), (-0.2, -0.5), (0.5, -0.95)])
@@ -359,17 +357,12 @@ def test_the_guide_crouches_on_slopes(plane, roll, crouch):
     assert loco_mtrl.advise(plane)[4] == pytest.approx(crouch, abs=1e-6)
 
 
-def test_time_around_by_hand(plane):
-    plane.reset(seed=0)
-    plane.trail = [(9.0, 9.0)] * 5 + [(0.0, 0.0)] * 38 + [(0.5, 0.0)] * 2
-    seconds = plane.time_around(np.array([0.0, 0.5, 2.0]), np.zeros(3))
-    # The last 40 places count, each by 1 - d^2: 38 and 2 of them, 0.5 m apart.
-    assert seconds == pytest.approx([38 + 2 * 0.75, 38 * 0.75 + 2, 0.0])
-
-
-def test_the_guide_is_silent_when_the_simulation_breaks_down():
+@pytest.mark.parametrize("steps", [0, 1])  # the second time the LiDAR turns
+def test_the_guide_is_silent_when_the_simulation_breaks_down(steps):
     with closing(Guide(LocoEnv("flat"))) as env:
         env.reset(seed=0)
+        for _ in range(steps):
+            env.step(np.zeros(17))
         env.unwrapped.bullet.resetBaseVelocity(env.unwrapped.robot, (0, 0, 0), (np.nan, 0, 0))
         _, _, terminated, _, info = env.step(np.zeros(17))
         assert terminated and info["exploded"] and np.isnan(info["guide"]).all()
@@ -538,12 +531,12 @@ def test_mirror_is_what_a_mirrored_robot_would_observe(flat):
     for side, act in ((1, action), (-1, action[j] * t)):
         flat.generator.reset(0.7 + (np.pi if side < 0 else 0.0))
         flat.goal = flat.origin + [9.0, 1.5 * side, 0.45]
+        flat.chart = terrain.Chart(flat.origin[0] + 6.0, 0.0, flat.goal)  # nothing seen yet
         flat.target = flat.generator.step(act[:5], 0.01)
         joints = np.random.default_rng(2).uniform(-0.5, 0.5, 12).reshape(4, 3)
         joints = (joints if side > 0 else joints[[1, 0, 3, 2]]).ravel()
         for joint, angle in zip(flat.joints, joints, strict=True):
             flat.bullet.resetJointState(flat.robot, joint, angle)
-        flat.trail = [(flat.origin[0] + 5.0, 0.7 * side), (flat.origin[0] + 5.5, -0.1 * side)]
         place(flat, 6.0, 0.2 * side, 0.6, yaw=0.4 * side, roll=0.1 * side)
         flat.bullet.resetBaseVelocity(flat.robot, (0, 0, 0), (0.3 * side, 0.5, 0.7 * side))
         observations.append(flat._observe())

@@ -1,5 +1,6 @@
 """Tasks and worlds: what they are, that they can be walked, and that the mesh is the ground."""
 
+import heapq
 from collections import deque
 from pathlib import Path
 
@@ -440,7 +441,7 @@ def test_chart_knows_walls_and_edges_and_lets_ramps_and_kerbs_be(shape, x, block
               "drop": lambda x, y: np.where(x > 0.6, -1.2, 0.0),
               "ramp": lambda x, y: 0.36 * np.maximum(x - 0.6, 0),  # 20 degrees
               "kerb": lambda x, y: np.where(x > 0.6, 0.1, 0.0)}[shape]
-    chart = terrain.Chart()
+    chart = terrain.Chart(0, 0, (8, 0))
     for eye in (0.0, 0.1, 0.2):
         sweep(chart, ground, np.array([eye, 0.0, 0.38]))
     y = np.linspace(-0.5, 0.5, 11)
@@ -450,7 +451,7 @@ def test_chart_knows_walls_and_edges_and_lets_ramps_and_kerbs_be(shape, x, block
 
 
 def test_chart_takes_the_unknown_for_open_ground_and_forgets_people():
-    chart = terrain.Chart()
+    chart = terrain.Chart(0, 0, (8, 0))
     person = lambda x, y: np.where(np.hypot(x - 2, y) < 0.3, 1.7, 0.0)  # noqa: E731
     eye = np.array([0.0, 0.0, 0.38])
     sweep(chart, person, eye)
@@ -463,8 +464,50 @@ def test_chart_takes_the_unknown_for_open_ground_and_forgets_people():
 
 
 def test_chart_remembers_a_wall_where_it_is_when_the_robot_goes_on():
-    chart = terrain.Chart()
+    chart = terrain.Chart(0, 0, (8, 0))
     sweep(chart, lambda x, y: np.where(x > 1.4, 1.0, 0.0), np.array([0.0, 0.0, 0.38]))
     for x, y in ((-1.0, 0.7), (-2.3, -1.1)):
         chart.draw(x, y, 0.0)
         assert chart.effort(1.5, 0.0) == 50 and chart.effort(0.5, 0.0) == 1
+
+
+def test_to_go_is_the_straight_distance_until_something_is_seen():
+    chart = terrain.Chart(3.0, -1.0, (9.0, 2.0))
+    x, y = np.random.default_rng(0).uniform(-8, 12, (2, 500))
+    x, y = (a[np.hypot(x - 9, y - 2) > 0.5] for a in (x, y))  # between squares it is a cone's tip
+    np.testing.assert_allclose(chart.to_go(x, y), np.hypot(x - 9, y - 2), atol=0.02)
+
+
+def test_to_go_is_the_shortest_way_by_dijkstra():
+    """Around a wall in the middle of what the robot sees, against a search with a heap."""
+    chart = terrain.Chart(0, 0, (2.5, 0.3))
+    wall = lambda x, y: np.where((np.abs(x - 1.2) < 0.1) & (y < 1.5), 1.0, 0.0)  # noqa: E731
+    sweep(chart, wall, np.array([0.0, 0.0, 0.38]), times=20)
+    squares = np.s_[112:208]  # those of 0.1 m that lie within 4.8 m
+    cost = chart.cost[squares, squares].reshape(48, 2, 48, 2).min((1, 3))
+    left = chart.left[56:104, 56:104].copy()
+    best = np.full((48, 48), np.inf)  # seeds: the goal, and the rim with what was left from there
+    rim = [(i, j) for i in range(48) for j in range(48) if {i, j} & {0, 47}]
+    heap = [(left[c], c) for c in [*rim, (24 + 12, 24 + 1)]]
+    heapq.heapify(heap)
+    while heap:
+        so_far, (i, j) = heapq.heappop(heap)
+        if so_far >= best[i, j]:
+            continue
+        best[i, j] = so_far
+        for a in (-1, 0, 1):
+            for b in (-1, 0, 1):
+                c = i + a, j + b
+                if (a or b) and 0 < c[0] < 47 and 0 < c[1] < 47:
+                    step = 0.2 * np.hypot(a, b) * (cost[i, j] + cost[c]) / 2
+                    heapq.heappush(heap, (so_far + step, c))
+    np.testing.assert_allclose(left[1:-1, 1:-1], best[1:-1, 1:-1], rtol=1e-4)
+    straight = np.hypot(2.5, 0.3)
+    assert chart.to_go(0.0, 0.0) > straight + 0.5  # the way around is longer
+
+
+def test_a_goal_beyond_the_map_is_far_away():
+    chart = terrain.Chart(0, 0, (40.0, 0.0))
+    chart.draw(0.0, 0.0, 0.0)
+    assert chart.to_go(0.0, 0.0) == pytest.approx(40, abs=0.1)
+    assert chart.to_go(100.0, 100.0) > 20  # whoever leaves the map stands at its rim
