@@ -218,8 +218,8 @@ class LocoEnv(gymnasium.Env):
     | 12 | q, joint angles: FR, FL, RR, RL x abduction, hip, knee | rad |
     | 12 | a_{t-1}, joint targets commanded in the previous step | rad |
     | 13 | s_tg, state of the trajectory generator; none with tg=False | |
-    The paper's robot knows neither its tilt nor where it has been: paper=True leaves chart, ways
-    and tilt out, and lidar=False all that is seen. That is taken at 15 Hz, all else at 30 Hz.
+    The paper's robot draws no map and does not know its tilt: paper=True leaves chart, ways and
+    tilt out, and lidar=False all that is seen. That is taken at 15 Hz, all else at 30 Hz.
 
     ## Action: Box(-1, 1, (17,), float32), clipped to that range, then smoothed
     5 parameters of the trajectory generator (`tg.PARAMETERS`), then the 12 residuals u_fb;
@@ -1105,7 +1105,7 @@ def parse(argv):
     p.add_argument("--no-lidar", dest="lidar", action="store_false", help="blind policy")
     p.add_argument("--paper", action="store_true",
                    help="the paper's own state and reward: the robot knows neither its tilt nor "
-                   "where it was, a fall costs nothing, and there is no guide")
+                   "a map, a fall costs nothing, and there is no guide")
     p.add_argument("--no-guide", dest="guide", action="store_false",
                    help="from rewards alone: no guide who knows the map shows the way in training")
     p.add_argument("--sequential", action="store_true", help="one task after the other, not mixed")
