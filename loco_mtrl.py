@@ -160,15 +160,16 @@ def weigh_ways(env, effort):
     """What it would take to go straight along each of the scan's columns, to each of _PACES.
 
     effort(x, y): what a metre costs there, as in Terrain.effort, but in Bullet's frame.
-    Returns two arrays (15, 24), in metres of open ground: the effort of the way; and the whole
-    cost: that effort, what is left from there to the goal in the robot's own chart, and up to
-    0.3 m for the turn.
+    Returns, in metres of open ground, the effort of each way (15, 24); and the least that going by
+    each column costs in all (24,): the effort to some place on it, from 0.6 m on, what is left
+    from there to the goal in the robot's own chart, and up to 0.3 m for the turn.
     """
     x, y, _ = env.position
     angles, paces = env.yaw + _LINES, _PACES[:, None]
     px, py = x + paces * np.cos(angles), y + paces * np.sin(angles)
     way = 0.3 * effort(px, py).cumsum(0)
-    return way, way + env.chart.to_go(px, py) + 0.3 * np.abs(_LINES) / np.pi
+    whole = (way + env.chart.to_go(px, py))[1:].min(0)  # nearer, all columns would look alike
+    return way, whole + 0.3 * np.abs(_LINES) / np.pi
 
 
 # ------------------------------------------------------------------------------- the environment
@@ -509,7 +510,6 @@ class LocoEnv(gymnasium.Env):
         if self.steps % CHART_EVERY == 0:
             self.chart.draw(x, y, z - BASE_HEIGHT)
         way, whole = weigh_ways(self, self.chart.effort)
-        whole = whole[1:].min(0)
         costs = np.vstack([way[_CHARTED], whole - whole.min()])
         return (np.log1p(costs) / math.log1p(225)).ravel()  # 225: all the way in a wall
 
@@ -587,7 +587,7 @@ def advise(env):
     turn = math.remainder(math.atan2(to_y - y, to_x - x) - env.yaw, 2 * math.pi)
     if env.distance > 0.7:
         _, whole = weigh_ways(env, lambda x, y: env.terrain.effort(x - env.origin[0], y))
-        turn = _LINES[whole[1:].min(0).argmin()]
+        turn = _LINES[whole.argmin()]
     # The strides: slower in a bend, on the spot where the way lies to the side or behind.
     forward = PACE * max(0.0, math.cos(turn)) ** 2
     aside = 0.2 * min(max(1.2 * turn, -1.0), 1.0)
