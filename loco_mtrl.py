@@ -722,9 +722,6 @@ def train(args):
         if int(os.environ.get("RANK", 0)) == 0:
             print(f"\nStopped. To go on from the last checkpoint: {_again(args)}")
         return 130
-    finally:
-        if torch.distributed.is_initialized():  # its threads would abort a process that just ends
-            torch.distributed.destroy_process_group()
     if int(os.environ.get("RANK", 0)) == 0:
         checkpoint = load_checkpoint(run_dir / "checkpoint.pt")
         # To be shared: who acts needs no critic, and half the bits change an action by less than a

@@ -7,6 +7,7 @@ around them: one process or, started by torchrun, all cores or several machines.
 Shapes: T = num_steps, N = num_envs of one rank, B = any batch.
 """
 
+import atexit
 import copy
 import csv
 import json
@@ -556,12 +557,17 @@ def learn(make_env, config, *, run_dir=None, resume=False, mirror=None, init=Non
             raise ValueError(f"{name} = {locals()[name]!r}, but it must be {valid}")
     torch.set_num_threads(1)  # nets this small only lose by more
     if int(os.environ.get("WORLD_SIZE", 1)) > 1 and not dist.is_initialized():
+        # An optimiser would import it later, when it would keep hold of the open group for good.
+        import torch.distributed.nn as _  # noqa: F401
+
         store, rank, world = next(dist.rendezvous("env://"))
         # After a crash torchrun starts the ranks again, with the same store (--max-restarts): they
         # must not find the addresses of the dead in it.
         store = dist.PrefixStore(os.environ.get("TORCHELASTIC_RESTART_COUNT", "0"), store)
-        # Left open: a second learn() goes on with it.
         dist.init_process_group("gloo", store=store, rank=rank, world_size=world)
+        # Open until the process ends: a second learn() goes on with it. But closed then: threads
+        # of it that outlive Python now and then abort the process.
+        atexit.register(lambda: dist.is_initialized() and dist.destroy_process_group())
     rank, world = (dist.get_rank(), dist.get_world_size()) if dist.is_initialized() else (0, 1)
 
     opened = [None]
