@@ -27,7 +27,7 @@ PAD = 9  # pillars, depth of the flat strip at both ends where episodes start (1
 ROUTES = 8  # start and goal pairs per training terrain
 CHART = 0.1  # m, squares of the map that a robot draws
 DROP = 0.21  # m below the robot's feet from where on a ray has passed an edge
-FADE = 0.8  # of heights in that map, each time that it is drawn
+FADE = 0.8  # of heights in that map, each time that a ray passes lower
 TRIES = 20  # redraws before a generator is said to yield no route
 
 PERSON_RADIUS, PERSON_HEIGHT = 0.25, 1.7  # m, the body that an environment gives a Person
@@ -305,9 +305,10 @@ class Chart:
     """What a robot has seen of the ground, a map that it draws itself from its LiDAR's hits.
 
     Squares of CHART m a side know the lowest and the highest hit in them, and whether a ray has
-    gone over them to something lower. Larger ones of 2 x 2 know what is `left` from there to the
-    goal: the length of the way, a metre counted as in `Terrain.cost`. What is not seen yet is open
-    ground; so at first that is the straight distance, and it grows as walls are found.
+    gone over them to something lower. What a ray passes through is forgotten: it was a person.
+    Larger squares of 2 x 2 know what is `left` from there to the goal: the length of the way, a
+    metre counted as in `Terrain.cost`. What is not seen yet is open ground; so at first that is the
+    straight distance, and it grows as walls are found.
 
     The map is 32 m wide, around x, y (m), where the robot starts. goal: x, y, ... in m.
     """
@@ -337,6 +338,7 @@ class Chart:
         """Enters a scan: rays from `eyes` to `hits` (R, 3) m, where they end by a `hit` (R,) or in
         the air; `ground`: m, the height on which the robot stands.
         """
+        self._clear(eyes, hits, ground)
         # A little further: what is hit lies behind its surface, in the square there.
         ends = hits[hit] + 0.002 * (hits - eyes)[hit]
         at, z = self._at(ends), ends[:, 2].astype(np.float32)
@@ -348,6 +350,22 @@ class Chart:
         a, b = eyes[over], hits[over]
         part = (level - a[:, 2]) / (b[:, 2] - a[:, 2])
         np.fmin.at(self.below, self._at(a + part[:, None] * (b - a)), level)
+
+    def _clear(self, eyes, hits, ground):
+        """Lowers what rays have passed through: people move on. See `see`."""
+        way = hits - eyes
+        length = np.hypot(way[:, 0], way[:, 1])
+        # Not to the very end of a wall: met at a slant, rays graze squares that are wall.
+        end = length - np.where(hits[:, 2] > ground + 0.1, 0.3, 0)
+        eyes, way, length, end = (a[end > 0.3] for a in (eyes, way, length, end))
+        paces = np.arange(0.3, end.max(initial=0.3), CHART)
+        ray, pace = np.nonzero(paces < end[:, None])
+        points = eyes[ray] + (paces[pace] / length[ray])[:, None] * way[ray]
+        through, z = self._at(points), points[:, 2].astype(np.float32)
+        gone = self.high[through] > z + 0.05
+        at, z = through[gone], z[gone]
+        self.low[at] += (1 - FADE) * np.minimum(z - self.low[at], 0)
+        self.high[at] = self.low[at] + FADE * (self.high[at] - self.low[at])
 
     def draw(self, x, y, ground):
         """Works out anew what a metre costs, and what is left from where, up to 4.8 m around x, y.
@@ -361,7 +379,6 @@ class Chart:
                             for a in (self.low, self.high, self.below))
         z = (low + high) / 2  # NaN: not seen yet
         edge = high - low > STEP
-        high[:] = low + FADE * (high - low)  # people shall leave no walls behind
         off = np.abs(z - ground)  # of two squares with a step between, the odd one is in the way
         for one, other in ((np.s_[1:], np.s_[:-1]), (np.s_[:, 1:], np.s_[:, :-1])):
             step, odd = np.abs(z[one] - z[other]) > STEP, off[one] > off[other]
