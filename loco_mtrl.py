@@ -185,6 +185,9 @@ POSITION_GAIN, VELOCITY_GAIN = 0.10, 1.0
 SMOOTHING = np.array([0.2] * TrajectoryGenerator.action_size + [0.5] * 12)
 RESIDUAL = {True: 0.1, False: 0.6}  # rad, largest u_fb with the TG, and without
 GOAL_RADIUS = 0.5  # m, r_g
+# What the paper has not: a guide in training (`Guide`), a map and the tilt among what the robot
+# observes, the cost of a fall in its reward.
+OURS = ("guide", "map", "tilt", "fall")
 BASE_HEIGHT = 0.30  # m, of the walking base: a goal floats that high over the ground
 EXPLODED = 1e3  # m or rad/s
 # Without it, running up to an edge earns as much as stopping there, and only who has first learned
@@ -219,8 +222,8 @@ class LocoEnv(gymnasium.Env):
     | 12 | q, joint angles: FR, FL, RR, RL x abduction, hip, knee | rad |
     | 12 | a_{t-1}, joint targets commanded in the previous step | rad |
     | 13 | s_tg, state of the trajectory generator; none with tg=False | |
-    The paper's robot draws no map and does not know its tilt: paper=True leaves chart, ways and
-    tilt out, and lidar=False all that is seen. That is taken at 15 Hz, all else at 30 Hz.
+    The paper's robot draws no map and does not know its tilt: paper=["map", "tilt"] leaves chart,
+    ways and tilt out, lidar=False all that is seen. That is taken at 15 Hz, all else at 30 Hz.
 
     ## Action: Box(-1, 1, (17,), float32), clipped to that range, then smoothed
     5 parameters of the trajectory generator (`tg.PARAMETERS`), then the 12 residuals u_fb;
@@ -229,7 +232,7 @@ class LocoEnv(gymnasium.Env):
 
     ## Reward
     (d_{t-1} - d_t) / dt, the velocity toward the goal, m/s. The paper prints the opposite sign but
-    calls it the velocity toward the target. A fall costs 2 m / dt: ours, paper=True leaves it out.
+    calls it the velocity toward the target. A fall costs 2 m / dt: ours, but for paper=["fall"].
 
     ## Episode
     It terminates at the goal (base within 0.5 m) and in a fall (base tipped by over 60 degrees or
@@ -244,7 +247,7 @@ class LocoEnv(gymnasium.Env):
             of these; None: all pillar tasks. Each episode draws one; the policy is not told which.
         difficulty: in [0, 1], or (low, high) to draw it from, once for each terrain.
         tg, lidar: the paper's ablations (section 3) leave one of them out.
-        paper: the paper's own state and reward: no chart, no tilt, no cost of a fall.
+        paper: which parts of OURS shall be as the paper has them, left out.
         terrains: how many terrains of each task to build; Bullet never frees a mesh, so the pool
             is built once and episodes draw from it. A finished Terrain counts once.
         pool_seed: seeds the pool; `reset(seed=...)` seeds all else.
@@ -257,7 +260,7 @@ class LocoEnv(gymnasium.Env):
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": round(1 / DT)}
 
-    def __init__(self, tasks=None, difficulty=(0.0, 1.0), tg=True, lidar=True, paper=False,
+    def __init__(self, tasks=None, difficulty=(0.0, 1.0), tg=True, lidar=True, paper=(),
                  terrains=1, pool_seed=0, render_mode=None, gui=False):
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
@@ -266,6 +269,8 @@ class LocoEnv(gymnasium.Env):
             raise ValueError(f"difficulty must be in [0, 1] or (low, high), got {difficulty}")
         if not isinstance(terrains, int) or terrains < 1:
             raise ValueError(f"terrains must be a whole number of at least 1, got {terrains!r}")
+        if not isinstance(paper, (list, tuple)) or not all(part in OURS for part in paper):
+            raise ValueError(f"paper must list some of {', '.join(OURS)}, got {paper!r}")
         self.render_mode, self.show_lidar = render_mode, False
         tasks = list(PILLAR_TASKS) if tasks is None else tasks
         tasks = tasks if isinstance(tasks, (list, tuple)) else [tasks]
@@ -277,13 +282,13 @@ class LocoEnv(gymnasium.Env):
         self.generator = TrajectoryGenerator() if tg else None
         self._connect(gui)
         rows, columns = LIDAR_AZIMUTHS.shape
-        charted = len(CHART_RADII) + 1 if lidar and not paper else 0
-        self.scan_shape = rows * lidar + charted, columns
-        self.lidar, self.paper = lidar, paper
+        self.lidar, self.paper = lidar, tuple(paper)
+        self.charted = lidar and "map" not in paper
+        self.scan_shape = rows * lidar + (len(CHART_RADII) + 1) * self.charted, columns
         n_scan = math.prod(self.scan_shape)
         self.scan = np.zeros(n_scan, np.float32)
         # Generous bounds: what lies beyond them is no longer a robot, and the episode ends.
-        high = [1e3, np.pi] + [1e3] * 3 + [1.0] * 2 * (not paper) + [1e2] * 24
+        high = [1e3, np.pi] + [1e3] * 3 + [1.0] * 2 * ("tilt" not in paper) + [1e2] * 24
         high += [1.0] * TrajectoryGenerator.state_size * tg
         low = np.concatenate([np.zeros(n_scan + 1), np.negative(high[1:])])
         high = np.concatenate([np.ones(n_scan), high])
@@ -453,7 +458,7 @@ class LocoEnv(gymnasium.Env):
             return np.zeros_like(observation), 0.0, True, False, self._info(False, True)
         success = self.distance < GOAL_RADIUS
         fall = self.up < FALL_UP or self.velocity[2] < -FALL_SPEED
-        cost = FALL_COST if fall and not success and not self.paper else 0.0
+        cost = FALL_COST if fall and not success and "fall" not in self.paper else 0.0
         reward = (distance - self.distance - cost) / DT
         return observation, reward, success or fall, False, self._info(success, fall)
 
@@ -482,7 +487,7 @@ class LocoEnv(gymnasium.Env):
         state = [self.distance, (heading + math.pi) % (2 * math.pi) - math.pi]
         wx, wy, wz = self.rates
         state += [r[i] * wx + r[3 + i] * wy + r[6 + i] * wz for i in range(3)]
-        if not self.paper:
+        if "tilt" not in self.paper:
             state += [-r[6], -r[7]]
         state += [joint[0] for joint in p.getJointStates(self.robot, self.joints)]
         state += self.target.tolist()
@@ -496,7 +501,7 @@ class LocoEnv(gymnasium.Env):
             # The root: as fine as a scan of 3 m is near by, and yet it looks across a room.
             fractions = np.fromiter(map(HIT_FRACTION, self.hits), np.float32, N_RAYS)
             self.scan[:N_RAYS] = np.sqrt(fractions)
-            if not self.paper:
+            if self.charted:
                 self.scan[N_RAYS:] = self._draw_chart(r, fractions)
         observation[: self.scan.size] = self.scan
         return observation
@@ -546,10 +551,10 @@ class LocoEnv(gymnasium.Env):
         swap = np.array([1, 0, 3, 2])
         parameters = np.array([0, 2, 1, 3, 4])  # left and right stride change places
         scan = np.arange(self.scan.size).reshape(self.scan_shape)[:, ::-1].ravel()
-        base = np.arange(5 if self.paper else 7)
+        base = np.arange(5 if "tilt" in self.paper else 7)
         parts, signs = [scan, base, legs, legs], np.ones(self.observation_space.shape)
         # heading, roll rate, yaw rate, tilt to the left
-        signs[scan.size + np.array([1, 2, 4] if self.paper else [1, 2, 4, 6])] = -1
+        signs[scan.size + np.array([1, 2, 4, 6][: 3 if "tilt" in self.paper else 4])] = -1
         actions = [legs]
         if self.generator:
             parts += [swap, swap, parameters]
@@ -657,7 +662,7 @@ def plan(args):
     middle = first | dict(num_steps=512, gamma=0.998, target_kl=0.02)
     last = middle | dict(num_steps=1024, max_std=0.15)
     start = min(SHORT_UNTIL / args.steps, 0.7)
-    if args.guide and args.tg and not args.paper:
+    if args.tg and "guide" not in args.paper:
         # Advice has no noise that a trust region would have to guard against.
         follow = dict(guide_share=1.0, update_epochs=3, target_kl=1e9)
         first |= follow | dict(max_std=0.2) | _constant(1e-3)
@@ -683,7 +688,7 @@ def train(args):
     if "WORLD_SIZE" not in os.environ and args.ranks > 1:
         return launch(args)
     options = {"tg": args.tg, "lidar": args.lidar, "paper": args.paper}
-    meta = {**options, "tasks": args.tasks, "sequential": args.sequential, "guide": args.guide,
+    meta = {**options, "tasks": args.tasks, "sequential": args.sequential,
             "seed": args.seed, "command": "python loco_mtrl.py " + " ".join(args.argv),
             "commit": _commit()}
     stages = plan(args)
@@ -1100,11 +1105,10 @@ def parse(argv):
                    help="comma-separated; default: all %(default)s")
     p.add_argument("--no-tg", dest="tg", action="store_false", help="reactive policy")
     p.add_argument("--no-lidar", dest="lidar", action="store_false", help="blind policy")
-    p.add_argument("--paper", action="store_true",
-                   help="the paper's own state and reward: the robot knows neither its tilt nor "
-                   "a map, a fall costs nothing, and there is no guide")
-    p.add_argument("--no-guide", dest="guide", action="store_false",
-                   help="from rewards alone: no guide who knows the map shows the way in training")
+    p.add_argument("--paper", type=_names(OURS, "part"), nargs="?", const=list(OURS), default=[],
+                   help="state, reward and training as in the paper, without what is ours: a "
+                   "guide who shows the way in training, the robot's map, its feeling of tilt, the "
+                   f"cost of a fall; or only without those named ({','.join(OURS)})")
     p.add_argument("--sequential", action="store_true", help="one task after the other, not mixed")
     p.add_argument("--seed", type=_whole(0), default=0)
     p.add_argument("--run-dir", default="runs/main", help="(default %(default)s)")

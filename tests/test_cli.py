@@ -151,6 +151,7 @@ def test_play_writes_a_gif_that_moves_and_a_map(trained):
     [
         (["fly"], "fly"),
         (["train", "--tasks", "lava"], "lava"),
+        (["train", "--paper", "map,legs"], "unknown part 'legs'"),
         (["train", "--tasks", ""], "unknown task ''"),
         (["train", "--steps", "-5"], "-5"),
         (["train", "--steps", "0"], "0"),
@@ -197,7 +198,7 @@ def test_wrong_checkpoints_are_named(trained, tmp_path, capsys):
     (tmp_path / "code.pt").write_bytes(pickle.dumps(os.system))
     torch.save({"model": 1}, tmp_path / "other.pt")
     model = ppo.ActorCritic(obs_dim=7, act_dim=2)
-    meta = {"tg": True, "lidar": True, "paper": False, "tasks": ["flat"], "sequential": False}
+    meta = {"tg": True, "lidar": True, "paper": [], "tasks": ["flat"], "sequential": False}
     ppo.save_checkpoint(tmp_path / "sizes.pt", model, ppo.PPOConfig(), meta=meta)
     for name in ("cut", "text", "code", "other", "sizes"):
         assert loco_mtrl.main(["eval", str(tmp_path / f"{name}.pt")]) == 2

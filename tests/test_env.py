@@ -65,7 +65,10 @@ def place(env, x, y, z, yaw=0.0, roll=0.0):
     return env._observe()
 
 
-@pytest.mark.parametrize("options", [{}, {"tg": False}, {"lidar": False}, {"paper": True}])
+OPTIONS = {}, {"tg": False}, {"lidar": False}, {"paper": loco_mtrl.OURS}, {"paper": ["tilt"]}
+
+
+@pytest.mark.parametrize("options", OPTIONS)
 def test_gymnasium_checks_pass_without_a_warning(options):
     env = gymnasium.make("LocoMTRL-v0", tasks="rugged", render_mode="rgb_array", **options)
     check_env(env.unwrapped)
@@ -265,7 +268,7 @@ def test_chart_shows_the_wall_that_the_lidar_has_seen_and_the_way_around_it():
         assert np.isnan(env.chart.low).sum() > env.chart.low.size - 300  # a new episode, a new map
 
 
-@pytest.mark.parametrize("paper", [True, False])
+@pytest.mark.parametrize("paper", [loco_mtrl.OURS, ()])
 def test_reward_is_velocity_toward_the_goal_and_sums_to_the_progress(paper):
     env = LocoEnv("rugged", difficulty=0.35, paper=paper)
     env.reset(seed=1)
@@ -303,12 +306,13 @@ def test_the_guide_reaches_the_goal_of_a_world(world):
 
 
 @pytest.mark.parametrize(("arguments", "shares"), [
-    ([], [1.0] * 5 + [0.5]), (["--no-guide"], [0.0] * 6), (["--paper"], [0.0] * 6),
+    ([], [1.0] * 5 + [0.5]), (["--paper", "guide"], [0.0] * 6), (["--paper"], [0.0] * 6),
+    (["--paper", "map,tilt,fall"], [1.0] * 5 + [0.5]),
     (["--no-tg"], [0.0] * 6), (["--no-lidar"], [1.0] * 5 + [0.5]),
     (["--sequential", "--tasks", "flat,walls"], [1.0, 1.0]),
 ])
 def test_who_learns_from_the_guide(arguments, shares):
-    """Strides and crouching are all he can teach; the paper knows no guide."""
+    """Strides and crouching are all that he teaches; the paper knows no guide."""
     stages = loco_mtrl.plan(loco_mtrl.parse(["train", *arguments]))
     assert [settings.get("guide_share", 0.0) for *_, settings in stages] == shares
     assert stages[-1][2] == 1.0
@@ -389,7 +393,7 @@ def test_success_ends_the_episode_at_the_goal(flat):
     assert info["success"] and not info["fall"] and info["t_cr"] == 1.0
 
 
-@pytest.mark.parametrize(("paper", "cost"), [(False, 2.0), (True, 0.0)])
+@pytest.mark.parametrize(("paper", "cost"), [((), 2.0), (["map"], 2.0), (["fall"], 0.0)])
 def test_tipping_over_is_a_fall_and_costs_two_metres(paper, cost):
     with closing(LocoEnv("flat", paper=paper)) as env:
         env.reset(seed=0)
@@ -512,7 +516,7 @@ def test_any_finite_action_gives_an_observation_in_the_space(flat, action):
 
 
 def test_mirror_is_its_own_inverse_and_fits_the_spaces():
-    for options in ({}, {"tg": False}, {"lidar": False}, {"paper": True}):
+    for options in OPTIONS:
         env = LocoEnv("flat", **options)
         i, s, j, t = env.mirror()
         observation = np.arange(env.observation_space.shape[0], dtype=float)
@@ -556,6 +560,8 @@ def test_mirror_is_what_a_mirrored_robot_would_observe(flat):
         ({"difficulty": "hard"}, "hard"),
         ({"terrains": 0}, "0"),
         ({"terrains": 1.5}, "1.5"),
+        ({"paper": True}, "True"),
+        ({"paper": ["map", "wings"]}, "wings"),
         ({"render_mode": "ascii"}, "ascii"),
     ],
 )
