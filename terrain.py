@@ -8,13 +8,14 @@ Frame: x runs along the m pillars from 0, y along the n pillars with 0 in the mi
 lengths are in metres and all angles in radians unless a name says otherwise.
 """
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 L = W = 0.2  # m, cross-section of a training pillar
 SHAPE = (60, 40)  # m x n pillars: 12 m x 8 m
@@ -255,12 +256,13 @@ def _cost(z, free, cell=CELL):
     It costs up to 9 beside what is not free, and 50 there; and 1 more for each tenth of slope above
     0.2. Where z is NaN nothing is known of slopes, nor paid for them.
     """
-    near, clear, rings = ~free, np.zeros(free.shape, np.float32), round(0.4 / cell)
+    near, rings = ~free, round(0.4 / cell)
+    inside = np.zeros(free.shape, np.float32)  # how many of the rings around what is not free
     for _ in range(rings):
-        clear += ~near / np.float32(rings)
+        inside += near
         near = _window(near, 1, np.maximum)
     slope = np.minimum(np.hypot(*np.gradient(z, cell)), 1)
-    cost = 1 + 8 * (1 - clear) ** 2 + 10 * np.fmax(slope - 0.2, 0)
+    cost = 1 + 8 * (inside / rings) ** 2 + 10 * np.fmax(slope - 0.2, 0)
     return np.where(free, cost, 50).astype(np.float32)
 
 
@@ -301,6 +303,11 @@ def _routes(ground, rng, count, reach, climb=CLIMB, zones=((0, np.inf),), margin
     return np.array(starts), np.array(goals), _cost(z, free)
 
 
+# m, half of what each of nine steps on the larger squares is long, and no standing still.
+_LENGTHS = CHART * np.hypot(*np.indices((3, 3)) - 1)[..., None, None].astype(np.float32)
+_LENGTHS[1, 1] = np.inf
+
+
 class Chart:
     """What a robot has seen of the ground, a map that it draws itself from its LiDAR's hits.
 
@@ -330,8 +337,8 @@ class Chart:
                 for c, low in zip((x, y), self.corner, strict=True))
         return i.clip(0, self.size - 1), j.clip(0, self.size - 1)
 
-    def _at(self, points):
-        i, j = self._squares(*points[:, :2].T)
+    def _at(self, x, y, *_):
+        i, j = self._squares(x, y)
         return i * self.size + j
 
     def see(self, eyes, hits, hit, ground):
@@ -341,7 +348,7 @@ class Chart:
         self._clear(eyes, hits, ground)
         # A little further: what is hit lies behind its surface, in the square there.
         ends = hits[hit] + 0.002 * (hits - eyes)[hit]
-        at, z = self._at(ends), ends[:, 2].astype(np.float32)
+        at, z = self._at(*ends.T), ends[:, 2].astype(np.float32)
         np.fmin.at(self.low, at, z)
         np.fmax.at(self.high, at, z)
         # Where a ray passes a step below, the ground can be no higher.
@@ -349,7 +356,7 @@ class Chart:
         over = hits[:, 2] < level
         a, b = eyes[over], hits[over]
         part = (level - a[:, 2]) / (b[:, 2] - a[:, 2])
-        np.fmin.at(self.below, self._at(a + part[:, None] * (b - a)), level)
+        np.fmin.at(self.below, self._at(*(a + part[:, None] * (b - a)).T), level)
 
     def _clear(self, eyes, hits, ground):
         """Lowers what rays have passed through: people move on. See `see`."""
@@ -357,11 +364,11 @@ class Chart:
         length = np.hypot(way[:, 0], way[:, 1])
         # Not to the very end of a wall: met at a slant, rays graze squares that are wall.
         end = length - np.where(hits[:, 2] > ground + 0.1, 0.3, 0)
-        eyes, way, length, end = (a[end > 0.3] for a in (eyes, way, length, end))
-        paces = np.arange(0.3, end.max(initial=0.3), CHART)
+        paces = np.arange(0.3, end.max(), CHART)
         ray, pace = np.nonzero(paces < end[:, None])
-        points = eyes[ray] + (paces[pace] / length[ray])[:, None] * way[ray]
-        through, z = self._at(points), points[:, 2].astype(np.float32)
+        part = paces[pace] / length[ray]
+        x, y, z = (a[ray] + part * b[ray] for a, b in zip(eyes.T, way.T, strict=True))
+        through, z = self._at(x, y), z.astype(np.float32)
         gone = self.high[through] > z + 0.05
         at, z = through[gone], z[gone]
         self.low[at] += (1 - FADE) * np.minimum(z - self.low[at], 0)
@@ -389,15 +396,14 @@ class Chart:
         self.cost[here] = cost = _cost(z, ~_window(edge, 2, np.maximum), CHART)
 
         # Value iteration: what is left from a square is a step and what is left from where it ends.
-        nx, ny = np.array(cost.shape) // 2
-        cost = cost.reshape(nx, 2, ny, 2).min((1, 3))
+        cost = np.minimum(cost[::2], cost[1::2])
+        cost = np.minimum(cost[:, ::2], cost[:, 1::2])
         left = self.left[tuple(slice(k.start // 2, k.stop // 2) for k in here)]  # a view
-        inner, steps = np.s_[1:-1, 1:-1], []
-        for a, b in ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1)):
-            there = np.s_[1 + a : nx - 1 + a, 1 + b : ny - 1 + b]
-            steps.append((there, CHART * math.hypot(a, b) * (cost[there] + cost[inner])))
+        inner = np.s_[1:-1, 1:-1]
+        around = partial(sliding_window_view, window_shape=left[inner].shape)  # (3, 3, ...): views
+        steps, there = _LENGTHS * (around(cost) + cost[inner]), around(left)
         for _ in range(self.rounds):
-            left[inner] = np.minimum.reduce([left[there] + step for there, step in steps])
+            left[inner] = np.add(there, steps, order="C").min((0, 1))  # that order is faster
             self.left[self.goal] = self.least
 
     def effort(self, x, y):
