@@ -160,8 +160,9 @@ def _heights(heights, least, cell):
     """`heights` as an array, `least` or more a side; ValueError if they or `cell` are no good."""
     heights = np.asarray(heights, float)
     if heights.ndim != 2 or min(heights.shape) < least or not np.isfinite(heights).all():
-        raise ValueError(f"heights must be a finite 2-D array of at least {least} x {least}, "
-                         f"got shape {heights.shape}")
+        bad = np.count_nonzero(~np.isfinite(heights))
+        raise ValueError(f"heights must be a finite 2-D array of at least {least} x {least}, got "
+                         f"shape {heights.shape} with {bad} numbers that are not finite")
     if not all(0 < side < np.inf for side in cell):
         raise ValueError(f"the cross-section must be positive and finite, got {tuple(cell)}")
     return heights
