@@ -143,7 +143,8 @@ def main():
     rows.append(("training steps/s, 1 rank", f"{one:.0f}"))
     rows.append(("training steps/s, 2 ranks", f"{two:.0f}"))
     rows.append(("  times those of 1 rank, two pairs", ratios))
-    rows.append(("  share of learning", f"{share:.2f}"))
+    rows.append(("training steps/s, 4 ranks", f"{training(4)[0]:.0f}"))
+    rows.append(("  share of learning, 2 ranks", f"{share:.2f}"))
     rows.append(("share of checkpoints, curves, checks for NaN", f"{precautions(one):.2%}"))
     for name, value in rows:
         print(f"{name:55}{value:>15}")

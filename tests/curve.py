@@ -2,7 +2,7 @@
 
     python tests/curve.py curve.png checkpoint1.pt checkpoint2.pt ...
 
-with copies of one run's checkpoint.pt, made while it trained. 10 episodes a world, 2 of each
+with copies of one run's checkpoint.pt, made while it trained. 5 episodes a world, one of each
 training task on held-out seeds. Prints what it draws; asserts nothing.
 """
 
@@ -23,8 +23,8 @@ def main(out, *checkpoints):
     minutes = [counter["minutes"] for counter in counters]
     figure = Figure(figsize=(8, 3.6), layout="constrained")
     axis = figure.subplots()
-    for label, places, episodes in (("training tasks", loco_mtrl.PILLAR_TASKS, 2),
-                                    ("unseen worlds", loco_mtrl.WORLDS, 10)):
+    for label, places, episodes in (("training tasks", loco_mtrl.PILLAR_TASKS, 1),
+                                    ("unseen worlds", loco_mtrl.WORLDS, 5)):
         scores = loco_mtrl.evaluate(actors, list(places), episodes, os.cpu_count())
         t_cr = {place: [np.mean([run["t_cr"] for run in runs]) for runs in of_place]
                 for place, of_place in scores.items()}
