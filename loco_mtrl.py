@@ -247,7 +247,7 @@ class LocoEnv(gymnasium.Env):
             of these; None: all pillar tasks. Each episode draws one; the policy is not told which.
         difficulty: in [0, 1], or (low, high) to draw it from, once for each terrain.
         tg, lidar: the paper's ablations (section 3) leave one of them out.
-        paper: which parts of OURS shall be as the paper has them, left out.
+        paper: which parts of OURS are left out, as in the paper; "guide" concerns training alone.
         terrains: how many terrains of each task to build; Bullet never frees a mesh, so the pool
             is built once and episodes draw from it. A finished Terrain counts once.
         pool_seed: seeds the pool; `reset(seed=...)` seeds all else.
@@ -1106,6 +1106,7 @@ def parse(argv):
     p.add_argument("--no-tg", dest="tg", action="store_false", help="reactive policy")
     p.add_argument("--no-lidar", dest="lidar", action="store_false", help="blind policy")
     p.add_argument("--paper", type=_names(OURS, "part"), nargs="?", const=list(OURS), default=[],
+                   metavar="PARTS",
                    help="state, reward and training as in the paper, without what is ours: a "
                    "guide who shows the way in training, the robot's map, its feeling of tilt, the "
                    f"cost of a fall; or only without those named ({','.join(OURS)})")

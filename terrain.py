@@ -304,7 +304,8 @@ def _routes(ground, rng, count, reach, climb=CLIMB, zones=((0, np.inf),), margin
     return np.array(starts), np.array(goals), _cost(z, free)
 
 
-# m, half of what each of nine steps on the larger squares is long, and no standing still.
+# m, half the length of a step to each of the squares around: each of the two squares that it joins
+# is paid for its half. To stay is no step.
 _LENGTHS = CHART * np.hypot(*np.indices((3, 3)) - 1)[..., None, None].astype(np.float32)
 _LENGTHS[1, 1] = np.inf
 
@@ -338,7 +339,7 @@ class Chart:
                 for c, low in zip((x, y), self.corner, strict=True))
         return i.clip(0, self.size - 1), j.clip(0, self.size - 1)
 
-    def _at(self, x, y, *_):
+    def _at(self, x, y):
         i, j = self._squares(x, y)
         return i * self.size + j
 
@@ -349,7 +350,7 @@ class Chart:
         self._clear(eyes, hits, ground)
         # A little further: what is hit lies behind its surface, in the square there.
         ends = hits[hit] + 0.002 * (hits - eyes)[hit]
-        at, z = self._at(*ends.T), ends[:, 2].astype(np.float32)
+        at, z = self._at(*ends[:, :2].T), ends[:, 2].astype(np.float32)
         np.fmin.at(self.low, at, z)
         np.fmax.at(self.high, at, z)
         # Where a ray passes a step below, the ground can be no higher.
@@ -357,7 +358,8 @@ class Chart:
         over = hits[:, 2] < level
         a, b = eyes[over], hits[over]
         part = (level - a[:, 2]) / (b[:, 2] - a[:, 2])
-        np.fmin.at(self.below, self._at(*(a + part[:, None] * (b - a)).T), level)
+        x, y = (a + part[:, None] * (b - a))[:, :2].T
+        np.fmin.at(self.below, self._at(x, y), level)
 
     def _clear(self, eyes, hits, ground):
         """Lowers what rays have passed through: people move on. See `see`."""
@@ -370,7 +372,7 @@ class Chart:
         part = paces[pace] / length[ray]
         x, y, z = (a[ray] + part * b[ray] for a, b in zip(eyes.T, way.T, strict=True))
         through, z = self._at(x, y), z.astype(np.float32)
-        gone = self.high[through] > z + 0.05
+        gone = self.high[through] > z + 0.05  # but for rays that graze the ground
         at, z = through[gone], z[gone]
         self.low[at] += (1 - FADE) * np.minimum(z - self.low[at], 0)
         self.high[at] = self.low[at] + FADE * (self.high[at] - self.low[at])
@@ -404,7 +406,8 @@ class Chart:
         around = partial(sliding_window_view, window_shape=left[inner].shape)  # (3, 3, ...): views
         steps, there = _LENGTHS * (around(cost) + cost[inner]), around(left)
         for _ in range(self.rounds):
-            left[inner] = np.add(there, steps, order="C").min((0, 1))  # that order is faster
+            # Else the sum keeps the views' order, along which the minimum takes twice as long.
+            left[inner] = np.add(there, steps, order="C").min((0, 1))
             self.left[self.goal] = self.least
 
     def effort(self, x, y):
