@@ -154,21 +154,20 @@ CHART_RADII, CHART_EVERY = (0.6, 1.5, 2.7, 4.5), 10
 _LINES = np.radians(LIDAR_AZIMUTHS[0])
 _PACES = np.arange(0.3, 4.6, 0.3)  # m, the places on a line
 _CHARTED = np.isin(np.round(_PACES, 1), CHART_RADII)
+LOG_WALL = math.log1p(225)  # all the way in a wall: what is observed are logarithms, in [0, 1]
 
 
-def weigh_ways(env, effort):
-    """What it would take to go straight along each of the scan's columns, to each of _PACES.
+def weigh_ways(chart, x, y, yaw):
+    """What it would take, by the map, to go straight along each of the scan's columns from x, y.
 
-    effort(x, y): what a metre costs there, as in Terrain.effort, but in Bullet's frame.
-    Returns, in metres of open ground, the effort of each way (15, 24); and the least that going by
-    each column costs in all (24,): the effort to some place on it, from 0.6 m on, what is left
-    from there to the goal in the robot's own chart, and up to 0.3 m for the turn.
+    Returns, in metres of open ground, the effort of going as far as each of _PACES (15, 24); and
+    the least that going by each column costs in all (24,): the effort to some place on it, from
+    0.6 m on, what is left from there to the goal, and up to 0.3 m for the turn.
     """
-    x, y, _ = env.position
-    angles, paces = env.yaw + _LINES, _PACES[:, None]
+    angles, paces = yaw + _LINES, _PACES[:, None]
     px, py = x + paces * np.cos(angles), y + paces * np.sin(angles)
-    way = 0.3 * effort(px, py).cumsum(0)
-    whole = (way + env.chart.to_go(px, py))[1:].min(0)  # nearer, all columns would look alike
+    way = 0.3 * chart.effort(px, py).cumsum(0)
+    whole = (way + chart.to_go(px, py))[1:].min(0)  # nearer, all columns would look alike
     return way, whole + 0.3 * np.abs(_LINES) / np.pi
 
 
@@ -185,14 +184,13 @@ POSITION_GAIN, VELOCITY_GAIN = 0.10, 1.0
 SMOOTHING = np.array([0.2] * TrajectoryGenerator.action_size + [0.5] * 12)
 RESIDUAL = {True: 0.1, False: 0.6}  # rad, largest u_fb with the TG, and without
 GOAL_RADIUS = 0.5  # m, r_g
-# What the paper has not: a guide in training (`Guide`), a map and the tilt among what the robot
-# observes, the cost of a fall in its reward.
-OURS = ("guide", "map", "tilt", "fall")
+# What the paper has not: a guide in training (`Guide`), and a map among what the robot observes.
+OURS = ("guide", "map")
 BASE_HEIGHT = 0.30  # m, of the walking base: a goal floats that high over the ground
 EXPLODED = 1e3  # m or rad/s
-# Without it, running up to an edge earns as much as stopping there, and only who has first learned
-# to stop lives to find the way along it.
-FALL_COST = 2.0  # m of progress
+# A person who meets more resistance steps back. A body that is moved regardless pushes with any
+# force: with 70 kN people have pressed the robot through walls.
+PUSH = 200.0  # N
 FALL_UP, FALL_SPEED = 0.5, 2.5  # fallen: tipped by over 60 degrees, or dropping faster (m/s)
 MAX_EPISODE_STEPS = 900  # 30 s
 PICTURE = (400, 300)  # pixels
@@ -209,7 +207,7 @@ def _about_z(yaw):
 class LocoEnv(gymnasium.Env):
     """A Laikago walks to a goal over terrain that only its LiDAR shows it (section 2).
 
-    ## Observation: Box((404,), float32), in the order of section 2.1
+    ## Observation: Box((402,), float32), in the order of section 2.1
     | entries | meaning | unit |
     |---|---|---|
     | 240 | r, LiDAR scan: sqrt(distance / 5 m), 1: no hit; rows from low to high, left to right | |
@@ -218,12 +216,11 @@ class LocoEnv(gymnasium.Env):
     | 1 | g_d, distance to the goal | m |
     | 1 | g_h, heading of the goal relative to the robot's, left positive | rad |
     | 3 | angular rates of the base in its own frame (IMU) | rad/s |
-    | 2 | tilt: where down is, its forward and left share in the base frame (IMU); ours | |
     | 12 | q, joint angles: FR, FL, RR, RL x abduction, hip, knee | rad |
     | 12 | a_{t-1}, joint targets commanded in the previous step | rad |
     | 13 | s_tg, state of the trajectory generator; none with tg=False | |
-    The paper's robot draws no map and does not know its tilt: paper=["map", "tilt"] leaves chart,
-    ways and tilt out, lidar=False all that is seen. That is taken at 15 Hz, all else at 30 Hz.
+    The paper's robot draws no map: paper=["map"] leaves chart and ways out, lidar=False all that is
+    seen. That is taken at 15 Hz, all else at 30 Hz.
 
     ## Action: Box(-1, 1, (17,), float32), clipped to that range, then smoothed
     5 parameters of the trajectory generator (`tg.PARAMETERS`), then the 12 residuals u_fb;
@@ -232,7 +229,7 @@ class LocoEnv(gymnasium.Env):
 
     ## Reward
     (d_{t-1} - d_t) / dt, the velocity toward the goal, m/s. The paper prints the opposite sign but
-    calls it the velocity toward the target. A fall costs 2 m / dt: ours, but for paper=["fall"].
+    calls it the velocity toward the target.
 
     ## Episode
     It terminates at the goal (base within 0.5 m) and in a fall (base tipped by over 60 degrees or
@@ -247,7 +244,7 @@ class LocoEnv(gymnasium.Env):
             of these; None: all pillar tasks. Each episode draws one; the policy is not told which.
         difficulty: in [0, 1], or (low, high) to draw it from, once for each terrain.
         tg, lidar: the paper's ablations (section 3) leave one of them out.
-        paper: which parts of OURS are left out, as in the paper; "guide" concerns training alone.
+        paper: which parts of OURS are left out, as in the paper; without both, no map is drawn.
         terrains: how many terrains of each task to build; Bullet never frees a mesh, so the pool
             is built once and episodes draw from it. A finished Terrain counts once.
         pool_seed: seeds the pool; `reset(seed=...)` seeds all else.
@@ -283,12 +280,13 @@ class LocoEnv(gymnasium.Env):
         self._connect(gui)
         rows, columns = LIDAR_AZIMUTHS.shape
         self.lidar, self.paper = lidar, tuple(paper)
-        self.charted = lidar and "map" not in paper
+        self.charted = lidar and "map" not in paper  # is the map shown? Is it drawn, for the guide?
+        self.charting = not {"guide", "map"} <= set(paper)
         self.scan_shape = rows * lidar + (len(CHART_RADII) + 1) * self.charted, columns
         n_scan = math.prod(self.scan_shape)
         self.scan = np.zeros(n_scan, np.float32)
         # Generous bounds: what lies beyond them is no longer a robot, and the episode ends.
-        high = [1e3, np.pi] + [1e3] * 3 + [1.0] * 2 * ("tilt" not in paper) + [1e2] * 24
+        high = [1e3, np.pi] + [1e3] * 3 + [1e2] * 24
         high += [1.0] * TrajectoryGenerator.state_size * tg
         low = np.concatenate([np.zeros(n_scan + 1), np.negative(high[1:])])
         high = np.concatenate([np.ones(n_scan), high])
@@ -414,6 +412,7 @@ class LocoEnv(gymnasium.Env):
         self.time, self.steps, self.collisions = 0.0, 0, 0
         self.chart = Chart(*position[:2], self.goal)
         self.touching = self.exploded = False
+        self.walked = np.zeros(len(self.people))  # seconds that each of them has been walking
         for body in self.people:  # not all terrains have as many
             p.resetBasePositionAndOrientation(body, (0, 0, -1000), (0, 0, 0, 1))
         self._move_people()
@@ -442,10 +441,11 @@ class LocoEnv(gymnasium.Env):
         p.stepSimulation()
         self.time += DT
         if self.people:
-            before, self.touching = self.touching, any(
-                p.getContactPoints(self.robot, body) for body in self.people
-            )
+            contacts = [p.getContactPoints(self.robot, body) for body in self.people]
+            before, self.touching = self.touching, any(contacts)
             self.collisions += self.touching and not before
+            for k, points in enumerate(contacts):
+                self.walked[k] += DT if sum(point[9] for point in points) < PUSH else -DT
             self._move_people()
 
         self.steps += 1
@@ -458,8 +458,7 @@ class LocoEnv(gymnasium.Env):
             return np.zeros_like(observation), 0.0, True, False, self._info(False, True)
         success = self.distance < GOAL_RADIUS
         fall = self.up < FALL_UP or self.velocity[2] < -FALL_SPEED
-        cost = FALL_COST if fall and not success and "fall" not in self.paper else 0.0
-        reward = (distance - self.distance - cost) / DT
+        reward = (distance - self.distance) / DT
         return observation, reward, success or fall, False, self._info(success, fall)
 
     def _info(self, success, fall):
@@ -469,8 +468,8 @@ class LocoEnv(gymnasium.Env):
                 "exploded": self.exploded}
 
     def _move_people(self):
-        for body, person in zip(self.people, self.terrain.people, strict=False):
-            x, y, yaw = person.position(self.time)
+        for body, person, t in zip(self.people, self.terrain.people, self.walked, strict=False):
+            x, y, yaw = person.position(t)
             place = x + self.origin[0], y, self.terrain.height(x, y) + PERSON_HEIGHT / 2
             self.bullet.resetBasePositionAndOrientation(body, place, _about_z(yaw))
 
@@ -487,36 +486,39 @@ class LocoEnv(gymnasium.Env):
         state = [self.distance, (heading + math.pi) % (2 * math.pi) - math.pi]
         wx, wy, wz = self.rates
         state += [r[i] * wx + r[3 + i] * wy + r[6 + i] * wz for i in range(3)]
-        if "tilt" not in self.paper:
-            state += [-r[6], -r[7]]
         state += [joint[0] for joint in p.getJointStates(self.robot, self.joints)]
         state += self.target.tolist()
         if self.generator:
             state += self.generator.state()
         observation = np.empty(self.observation_space.shape, dtype=np.float32)
         observation[self.scan.size :] = state
-        if turn_lidar and self.lidar and math.isfinite(self.distance):
+        if turn_lidar and math.isfinite(self.distance):
+            self._look(r)
+        observation[: self.scan.size] = self.scan
+        return observation
+
+    def _look(self, r):
+        """Turns the LiDAR once, draws what it sees, weighs the ways. r: the base's rotation (9,)"""
+        p, (x, y, z) = self.bullet, self.position
+        if self.lidar:
             self.hits = p.rayTestBatch(*self._rays, parentObjectUniqueId=self.robot,
                                        parentLinkIndex=-1, collisionFilterMask=STATIC_GROUP)
             # The root: as fine as a scan of 3 m is near by, and yet it looks across a room.
             fractions = np.fromiter(map(HIT_FRACTION, self.hits), np.float32, N_RAYS)
             self.scan[:N_RAYS] = np.sqrt(fractions)
-            if self.charted:
-                self.scan[N_RAYS:] = self._draw_chart(r, fractions)
-        observation[: self.scan.size] = self.scan
-        return observation
-
-    def _draw_chart(self, r, fractions):
-        """Enters a scan into the chart; what that says of each column's way, on a log scale."""
-        turn, (x, y, z) = np.reshape(r, (3, 3)).T, self.position
-        eyes = self._eyes @ turn + self.position
-        hits = eyes + fractions[:, None] * (self._reach @ turn)
-        self.chart.see(eyes, hits, fractions < 1, z - BASE_HEIGHT)
-        if self.steps % CHART_EVERY == 0:
-            self.chart.draw(x, y, z - BASE_HEIGHT)
-        way, whole = weigh_ways(self, self.chart.effort)
-        costs = np.vstack([way[_CHARTED], whole - whole.min()])
-        return (np.log1p(costs) / math.log1p(225)).ravel()  # 225: all the way in a wall
+        if not self.charting:
+            return
+        if self.lidar:
+            turn = np.reshape(r, (3, 3)).T
+            eyes = self._eyes @ turn + self.position
+            hits = eyes + fractions[:, None] * (self._reach @ turn)
+            self.chart.see(eyes, hits, fractions < 1, z - BASE_HEIGHT)
+            if self.steps % CHART_EVERY == 0:
+                self.chart.draw(x, y, z - BASE_HEIGHT)
+        way, self.whole = weigh_ways(self.chart, x, y, self.yaw)
+        if self.charted:
+            costs = np.vstack([way[_CHARTED], self.whole - self.whole.min()])
+            self.scan[N_RAYS:] = (np.log1p(costs) / LOG_WALL).ravel()
 
     def render(self):
         """The robot from above and behind, as uint8 (300, 400, 3)."""
@@ -551,10 +553,9 @@ class LocoEnv(gymnasium.Env):
         swap = np.array([1, 0, 3, 2])
         parameters = np.array([0, 2, 1, 3, 4])  # left and right stride change places
         scan = np.arange(self.scan.size).reshape(self.scan_shape)[:, ::-1].ravel()
-        base = np.arange(5 if "tilt" in self.paper else 7)
-        parts, signs = [scan, base, legs, legs], np.ones(self.observation_space.shape)
-        # heading, roll rate, yaw rate, tilt to the left
-        signs[scan.size + np.array([1, 2, 4, 6][: 3 if "tilt" in self.paper else 4])] = -1
+        parts = [scan, np.arange(5), legs, legs]
+        signs = np.ones(self.observation_space.shape)
+        signs[scan.size + np.array([1, 2, 4])] = -1  # heading, roll rate, yaw rate
         actions = [legs]
         if self.generator:
             parts += [swap, swap, parameters]
@@ -580,19 +581,18 @@ PACE = 0.21  # m, the guide's stride where his way is straight
 
 
 def advise(env):
-    """What a guide would do who knows the ground around him, as far as the robot could see it.
+    """What a guide would do: take the cheapest of the ways that the robot's own map shows.
 
-    He takes the cheapest of the ways that `weigh_ways` weighs, over the true ground, and crouches
-    on a slope. Returns an action, NaN for all but two strides and the stance height: (n_act,).
+    On a slope he crouches. Returns an action, NaN for all but two strides and the stance height:
+    (n_act,).
     """
     advice = np.full(env.action.shape, np.nan)
     if env.exploded:
         return advice
-    (x, y, _), (to_x, to_y, _) = np.subtract((env.position, env.goal), env.origin)
+    (x, y, _), (to_x, to_y, _) = env.position, env.goal
     turn = math.remainder(math.atan2(to_y - y, to_x - x) - env.yaw, 2 * math.pi)
     if env.distance > 0.7:
-        _, whole = weigh_ways(env, lambda x, y: env.terrain.effort(x - env.origin[0], y))
-        turn = _LINES[whole.argmin()]
+        turn = _LINES[env.whole.argmin()]
     # The strides: slower in a bend, on the spot where the way lies to the side or behind.
     forward = PACE * max(0.0, math.cos(turn)) ** 2
     aside = 0.2 * min(max(1.2 * turn, -1.0), 1.0)
@@ -606,8 +606,8 @@ def advise(env):
 class Guide(gymnasium.Wrapper):
     """Tells a robot in training the way: info["guide"] is what `advise` says.
 
-    He is no part of the policy, only of what it learns from: to recognise, in what its own senses
-    tell, which way he would go. The rest, NaN in his advice, it finds out for itself.
+    He is no part of the policy, only of what it learns from: which way to go. The rest, NaN in his
+    advice, it finds out for itself.
     """
 
     def reset(self, **kwargs):
@@ -622,12 +622,12 @@ class Guide(gymnasium.Wrapper):
 # ------------------------------------------------------------------------------- train
 
 REWARD_SCALE = 0.1  # keeps the critic's targets near 1
-MAIN_STEPS = 800_000  # of the no-argument run
-SHORT_UNTIL = 200_000  # steps
+MAIN_STEPS = 400_000  # of the no-argument run
+SHORT_UNTIL = 120_000  # steps
 HARD = (0.4, 1.0)  # difficulties after that, when it knows how to walk
 # Layouts of an environment, at most, and how often the main part of a training makes them anew: the
 # more it sees, the less it learns by heart.
-LAYOUTS, FRESH = 10, 4
+LAYOUTS, FRESH = 10, 3
 # The gait decides these (all but stones are soon done), and the noise of their samples drowns what
 # the others teach, which need eyes: they rest between the first and the last part.
 BLIND_TASKS = ("rugged", "holes", "stones", "pyramids_up", "pyramids_down", "gaps", "hurdles",
@@ -850,7 +850,7 @@ def walk_straight(observation, env):
 
 
 def follow_guide(observation, env):
-    """What a robot could reach that knew the map: the guide's strides on the same generator."""
+    """The guide himself: the ways that the map shows, no learning, on the same generator."""
     return np.nan_to_num(advise(env.unwrapped))
 
 
@@ -1107,9 +1107,9 @@ def parse(argv):
     p.add_argument("--no-lidar", dest="lidar", action="store_false", help="blind policy")
     p.add_argument("--paper", type=_names(OURS, "part"), nargs="?", const=list(OURS), default=[],
                    metavar="PARTS",
-                   help="state, reward and training as in the paper, without what is ours: a "
-                   "guide who shows the way in training, the robot's map, its feeling of tilt, the "
-                   f"cost of a fall; or only without those named ({','.join(OURS)})")
+                   help="state and training as in the paper, without what is ours: a guide who "
+                   "shows the way in training, and the robot's map; or only without those named "
+                   f"({','.join(OURS)})")
     p.add_argument("--sequential", action="store_true", help="one task after the other, not mixed")
     p.add_argument("--seed", type=_whole(0), default=0)
     p.add_argument("--run-dir", default="runs/main", help="(default %(default)s)")

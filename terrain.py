@@ -28,6 +28,7 @@ PAD = 9  # pillars, depth of the flat strip at both ends where episodes start (1
 ROUTES = 8  # start and goal pairs per training terrain
 CHART = 0.1  # m, squares of the map that a robot draws
 DROP = 0.21  # m below the robot's feet from where on a ray has passed an edge
+STEEP, BRINK = 0.65, 0.08  # slope of a ray, and m below the feet from where on such a one has
 FADE = 0.8  # of heights in that map, each time that a ray passes lower
 TRIES = 20  # redraws before a generator is said to yield no route
 
@@ -108,14 +109,8 @@ class Terrain:
     triangles: np.ndarray  # (F, 3) int, counter-clockwise seen from outside
     starts: np.ndarray  # (K, 4) x, y, ground z, yaw
     goals: np.ndarray  # (K, 3) x, y, ground z
-    cost: np.ndarray  # (nx, ny) effort of a metre in each CELL: 1 on open ground, 50 in a wall
     height: Callable  # height(x, y) -> ground z, arrays or scalars; -inf outside
     people: tuple[Person, ...] = ()
-
-    def effort(self, x, y):
-        """`cost` at x, y (m, arrays); outside, that of the border."""
-        i, j = (x / CELL).astype(int), (y / CELL + self.cost.shape[1] / 2).astype(int)
-        return self.cost[np.clip(i, 0, len(self.cost) - 1), np.clip(j, 0, len(self.cost[0]) - 1)]
 
 
 # ---------------------------------------------------------------- meshes
@@ -251,22 +246,6 @@ def _flood(free, start):
     return np.maximum(steps, -1).reshape(free.shape)
 
 
-def _cost(z, free, cell=CELL):
-    """Terrain.cost. A metre costs 1 where all is level and `free` for another 0.4 m around.
-
-    It costs up to 9 beside what is not free, and 50 there; and 1 more for each tenth of slope above
-    0.2. Where z is NaN nothing is known of slopes, nor paid for them.
-    """
-    near, rings = ~free, round(0.4 / cell)
-    inside = np.zeros(free.shape, np.float32)  # how many of the rings around what is not free
-    for _ in range(rings):
-        inside += near
-        near = _window(near, 1, np.maximum)
-    slope = np.minimum(np.hypot(*np.gradient(z, cell)), 1)
-    cost = 1 + 8 * (inside / rings) ** 2 + 10 * np.fmax(slope - 0.2, 0)
-    return np.where(free, cost, 50).astype(np.float32)
-
-
 def _pick(rng, mask):
     """A random True cell of `mask` as (i, j), or None."""
     cells = np.argwhere(mask)
@@ -275,7 +254,7 @@ def _pick(rng, mask):
 
 def _routes(ground, rng, count, reach, climb=CLIMB, zones=((0, np.inf),), margin=0.5,
             floor=-np.inf):
-    """`count` starts (K, 4), goals (K, 3) and the cost, as in Terrain; None: there are none.
+    """`count` starts (K, 4) and goals (K, 3), as in Terrain; None: there are none.
 
     Start k lies in the k-th of `zones` (ranges of x, taken in turn); a goal lies `reach` = (least,
     most) metres from its start, measured straight; both keep `margin` m from the border and lie
@@ -301,7 +280,23 @@ def _routes(ground, rng, count, reach, climb=CLIMB, zones=((0, np.inf),), margin
             return None
         starts.append((x[s], y[s], z[s], np.arctan2(y[g] - y[s], x[g] - x[s])))
         goals.append((x[g], y[g], z[g]))
-    return np.array(starts), np.array(goals), _cost(z, free)
+    return np.array(starts), np.array(goals)
+
+
+def _cost(z, free):
+    """Chart.cost of squares: 1 a metre where all is level and `free` for another 0.4 m around.
+
+    It is up to 9 beside what is not free, and 50 there; and 1 more for each tenth of slope above
+    0.2. Where z is NaN nothing is known of slopes, nor paid for them.
+    """
+    near, rings = ~free, round(0.4 / CHART)
+    inside = np.zeros(free.shape, np.float32)  # how many of the rings around what is not free
+    for _ in range(rings):
+        inside += near
+        near = _window(near, 1, np.maximum)
+    slope = np.minimum(np.hypot(*np.gradient(z, CHART)), 1)
+    cost = 1 + 8 * (inside / rings) ** 2 + 10 * np.fmax(slope - 0.2, 0)
+    return np.where(free, cost, 50).astype(np.float32)
 
 
 # m, half the length of a step to each of the squares around: each of the two squares that it joins
@@ -316,7 +311,7 @@ class Chart:
     Squares of CHART m a side know the lowest and the highest hit in them, and whether a ray has
     gone over them to something lower. What a ray passes through is forgotten: it was a person.
     Larger squares of 2 x 2 know what is `left` from there to the goal: the length of the way, a
-    metre counted as in `Terrain.cost`. What is not seen yet is open ground; so at first that is the
+    metre counted as in `_cost`. What is not seen yet is open ground; so at first that is the
     straight distance, and it grows as walls are found.
 
     The map is 32 m wide, around x, y (m), where the robot starts. goal: x, y, ... in m.
@@ -353,12 +348,15 @@ class Chart:
         at, z = self._at(*ends[:, :2].T), ends[:, 2].astype(np.float32)
         np.fmin.at(self.low, at, z)
         np.fmax.at(self.high, at, z)
-        # Where a ray passes a step below, the ground can be no higher.
-        level = np.float32(ground - DROP)
-        over = hits[:, 2] < level
-        a, b = eyes[over], hits[over]
-        part = (level - a[:, 2]) / (b[:, 2] - a[:, 2])
-        x, y = (a + part[:, None] * (b - a))[:, :2].T
+        # Where a ray passes a step below, the ground can be no higher. A steep one needs less of a
+        # margin, for no slope to walk on falls so: it has passed an edge.
+        over = hits[:, 2] < ground - DROP
+        a, way = eyes[over], (hits - eyes)[over]
+        steep = -way[:, 2] > STEEP * np.hypot(way[:, 0], way[:, 1])
+        level = ground - np.where(steep, BRINK, DROP)
+        part = (level - a[:, 2]) / way[:, 2]
+        x, y = (a + part[:, None] * way)[:, :2].T
+        level = np.where(steep, hits[over, 2], level).astype(np.float32)
         np.fmin.at(self.below, self._at(x, y), level)
 
     def _clear(self, eyes, hits, ground):
@@ -396,7 +394,7 @@ class Chart:
             edge[other] |= step & ~odd
         gone = np.isnan(z) & (_window(z, 4, np.fmax) - below > STEP)
         edge |= _window(gone, 1, np.maximum)  # the brink is nearer than where it shows
-        self.cost[here] = cost = _cost(z, ~_window(edge, 2, np.maximum), CHART)
+        self.cost[here] = cost = _cost(z, ~_window(edge, 2, np.maximum))
 
         # Value iteration: what is left from a square is a step and what is left from where it ends.
         cost = np.minimum(cost[::2], cost[1::2])
@@ -411,7 +409,7 @@ class Chart:
             self.left[self.goal] = self.least
 
     def effort(self, x, y):
-        """As Terrain.effort, as far as is known; the unknown is open ground."""
+        """What a metre costs at x, y (m, arrays), as far as is known: what is not costs 1."""
         return self.cost[self._squares(x, y)]
 
     def to_go(self, x, y):

@@ -120,17 +120,18 @@ def memory():
 
 
 def main():
-    rows, spent = [], {}
-    env = LocoEnv("rugged", difficulty=0.5)
-    step, reset = walk(env, STEPS)
-    measured, _ = walk(env, STEPS, spent)
-    env.close()
-    inside = sum(map(sum, spent.values())) / STEPS
+    rows = []
+    for label, paper in (("as the paper's", loco_mtrl.OURS), ("with the map", ())):
+        spent, env = {}, LocoEnv("rugged", difficulty=0.5, paper=paper)
+        step, reset = walk(env, STEPS)
+        measured, _ = walk(env, STEPS, spent)
+        env.close()
+        inside = sum(map(sum, spent.values())) / STEPS
+        rows.append((f"steps/s on one core, rugged pillars, {label}", f"{1 / step:.0f}"))
+        for name, seconds in spent.items():
+            rows.append((f"  ms a step in {name}", f"{sum(seconds) / STEPS * 1e3:.3f}"))
+        rows.append(("  share inside those two", f"{inside / measured:.2f}"))
     naive, _ = walk(NaiveEnv("rugged", difficulty=0.5), 200)
-    rows.append(("steps/s on one core, rugged pillars, 240 rays", f"{1 / step:.0f}"))
-    for name, seconds in spent.items():
-        rows.append((f"  ms a step in {name}", f"{sum(seconds) / STEPS * 1e3:.3f}"))
-    rows.append(("  share inside those two", f"{inside / measured:.2f}"))
     rows.append(("one box per pillar and the URDF's meshes: slower by", f"{naive / step:.0f}x"))
     rows.append(("reset", f"{reset * 1e3:.1f} ms"))
     size, growth = memory()

@@ -323,14 +323,6 @@ def test_a_metre_costs_more_on_slopes_and_beside_what_is_not_free():
     assert cost[25, 27] == 50
 
 
-def test_effort_is_that_of_the_ground_there_and_outside_that_of_the_border():
-    bar = make_terrain(lambda rng, difficulty: np.where(np.arange(60)[:, None] == 30, 1.0, 0.0)
-                       * np.ones(40) * (np.arange(40) < 20), np.random.default_rng(0), 1.0)
-    x, y = np.array([3.0, 6.1, 6.1, -5.0, 6.1]), np.array([0.0, -2.0, 2.5, 0.0, 99.0])
-    assert bar.effort(x, y).tolist() == [1, 50, 1, 50, 50]
-    assert bar.effort(x[:, None], y).shape == (5, 5)
-
-
 def test_doorways_of_the_offices():
     for seed in range(4):
         heights = make_world("office1", seed).height.heights
