@@ -8,7 +8,6 @@ Shapes: T = num_steps, N = num_envs of one rank, B = any batch.
 """
 
 import atexit
-import copy
 import csv
 import json
 import math
@@ -434,7 +433,7 @@ def save_checkpoint(path, model, config, *, optimiser=None, counters=None, meta=
     """Write a checkpoint that is whole or not there at all, even if the power fails.
 
     `meta` is the caller's own dict of plain values (else TypeError). Without `optimiser` the file
-    is a policy to share: it can be evaluated, or learned from (`init`), but not resumed.
+    is a policy to share: it can be evaluated, but not resumed.
     """
     content = {"format": FORMAT, "kwargs": model.kwargs, "model": model.state_dict(),
                "optimiser": optimiser.state_dict() if optimiser else None,
@@ -516,7 +515,7 @@ def draw_curve(run_dir, *names):
     figure.savefig(Path(run_dir) / "curve.png", dpi=100)
 
 
-def learn(make_env, config, *, run_dir=None, resume=False, mirror=None, init=None,
+def learn(make_env, config, *, run_dir=None, resume=False, mirror=None,
           episode_keys=("t_cr", "success", "fall"), group_key="task", groups=(), meta=None,
           on_update=None):
     """Train on `make_env` until config.total_timesteps; returns the ActorCritic.
@@ -528,7 +527,6 @@ def learn(make_env, config, *, run_dir=None, resume=False, mirror=None, init=Non
         run_dir: folder for config.json, progress.csv, curve.png, checkpoint.pt; None: no files.
         resume: go on from run_dir's checkpoint, with its network and its mirror.
         mirror: see ActorCritic.
-        init: an ActorCritic to start from, its mirror included, instead of a new one.
         episode_keys: what to average from the info of an episode's last step; the first of them
             also for each of `groups`, the values of info[group_key]. progress.csv has the means
             over each rank's last 100 episodes, NaN where there is none.
@@ -549,7 +547,6 @@ def learn(make_env, config, *, run_dir=None, resume=False, mirror=None, init=Non
     """
     for name, good, valid in (
         ("resume", not resume or run_dir is not None, "False where there is no run_dir"),
-        ("init", init is None or isinstance(init, ActorCritic), "an ActorCritic"),
         ("episode_keys", not isinstance(episode_keys, str), "several names"),
         ("groups", not isinstance(groups, str), "several names"),
     ):
@@ -594,8 +591,6 @@ def learn(make_env, config, *, run_dir=None, resume=False, mirror=None, init=Non
     dims = {"obs_dim": math.prod(obs_space.shape), "act_dim": math.prod(act_space.shape)}
     if checkpoint:
         model = build_policy(checkpoint)
-    elif init:
-        model = copy.deepcopy(init)
     else:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(config.seed)

@@ -26,11 +26,17 @@ STEP = 0.2  # m, highest step that they clear at all: what training may ask for
 FLAT = 0.05  # m, most that the ground under a start may vary
 PAD = 9  # pillars, depth of the flat strip at both ends where episodes start (1.8 m)
 ROUTES = 8  # start and goal pairs per training terrain
-CHART = 0.1  # m, squares of the map that a robot draws
+TRIES = 20  # redraws before a generator is said to yield no route
+
+# The map that a robot draws, Chart.
+CHART = 0.1  # m, its squares
+BODY = 2  # squares that it needs on each side of the one in which it is
 DROP = 0.21  # m below the robot's feet from where on a ray has passed an edge
 STEEP, BRINK = 0.65, 0.08  # slope of a ray, and m below the feet from where on such a one has
-FADE = 0.8  # of heights in that map, each time that a ray passes lower
-TRIES = 20  # redraws before a generator is said to yield no route
+HIDDEN = 4  # squares, at most, from the last ground that is seen to where a ray shows its edge
+GRAZE = 0.05  # m below a height that a ray must pass to have passed through it
+SPARED = 0.3  # m before a wall where rays pass through nothing: met at a slant, they graze it
+FADE = 0.8  # of a height is left when a ray passes through it
 
 PERSON_RADIUS, PERSON_HEIGHT = 0.25, 1.7  # m, the body that an environment gives a Person
 
@@ -363,14 +369,14 @@ class Chart:
         """Lowers what rays have passed through: people move on. See `see`."""
         way = hits - eyes
         length = np.hypot(way[:, 0], way[:, 1])
-        # Not to the very end of a wall: met at a slant, rays graze squares that are wall.
-        end = length - np.where(hits[:, 2] > ground + 0.1, 0.3, 0)
-        paces = np.arange(0.3, end.max(), CHART)
+        wall = hits[:, 2] > ground + 0.1
+        end = length - np.where(wall, SPARED, 0)
+        paces = np.arange(0.3, end.max(), CHART)  # not from the lens on: the robot stands there
         ray, pace = np.nonzero(paces < end[:, None])
         part = paces[pace] / length[ray]
         x, y, z = (a[ray] + part * b[ray] for a, b in zip(eyes.T, way.T, strict=True))
         through, z = self._at(x, y), z.astype(np.float32)
-        gone = self.high[through] > z + 0.05  # but for rays that graze the ground
+        gone = self.high[through] > z + GRAZE
         at, z = through[gone], z[gone]
         self.low[at] += (1 - FADE) * np.minimum(z - self.low[at], 0)
         self.high[at] = self.low[at] + FADE * (self.high[at] - self.low[at])
@@ -392,9 +398,9 @@ class Chart:
             step, odd = np.abs(z[one] - z[other]) > STEP, off[one] > off[other]
             edge[one] |= step & odd
             edge[other] |= step & ~odd
-        gone = np.isnan(z) & (_window(z, 4, np.fmax) - below > STEP)
+        gone = np.isnan(z) & (_window(z, HIDDEN, np.fmax) - below > STEP)
         edge |= _window(gone, 1, np.maximum)  # the brink is nearer than where it shows
-        self.cost[here] = cost = _cost(z, ~_window(edge, 2, np.maximum))
+        self.cost[here] = cost = _cost(z, ~_window(edge, BODY, np.maximum))
 
         # Value iteration: what is left from a square is a step and what is left from where it ends.
         cost = np.minimum(cost[::2], cost[1::2])

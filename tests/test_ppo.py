@@ -437,15 +437,6 @@ def test_the_noise_lasts_from_step_to_step():
         learn(lambda index: env(), PPOConfig(noise_correlation=(0.9, 0.0), **SMALL))
 
 
-def test_init_starts_from_a_trained_policy():
-    old = train(Probe, 3)
-    config = PPOConfig(total_timesteps=1, learning_rate=1e-12, min_learning_rate=1e-12,
-                       critic_learning_rate=1e-12, **SMALL)
-    new = learn(lambda index: Probe(), config, init=old)
-    assert new is not old
-    torch.testing.assert_close(new.actor.state_dict(), old.actor.state_dict())
-
-
 # --- spaces
 
 
@@ -587,7 +578,7 @@ def test_resuming_needs_a_checkpoint_and_an_env_that_fits(tmp_path):
 
 
 @pytest.mark.parametrize(("wrong", "named"), [
-    ({"resume": True}, "resume = True"), ({"init": "policy.pt"}, "'policy.pt'"),
+    ({"resume": True}, "resume = True"),
     ({"episode_keys": "t_cr"}, "'t_cr'"), ({"groups": "flat"}, "'flat'"),
     ({"mirror": ([1, 2], [1, 1], [0], [1])}, r"\[1, 2\]"),
 ])
