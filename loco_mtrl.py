@@ -7,7 +7,6 @@ Diverse Environments"; the sections named below are the paper's.
 
 import argparse
 import contextlib
-import functools
 import json
 import logging
 import math
@@ -20,6 +19,7 @@ import sys
 import tempfile
 import time
 import xml.etree.ElementTree as ET
+from functools import partial
 from numbers import Real
 from pathlib import Path
 
@@ -250,9 +250,6 @@ class LocoEnv(gymnasium.Env):
         pool_seed: seeds the pool; `reset(seed=...)` seeds all else.
         render_mode: None or "rgb_array".
         gui: open PyBullet's window; it allows one in a process.
-
-    Raises:
-        ValueError: for any argument out of range, naming it and what is valid.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": round(1 / DT)}
@@ -268,7 +265,7 @@ class LocoEnv(gymnasium.Env):
             raise ValueError(f"terrains must be a whole number of at least 1, got {terrains!r}")
         if not isinstance(paper, (list, tuple)) or not all(part in OURS for part in paper):
             raise ValueError(f"paper must list some of {', '.join(OURS)}, got {paper!r}")
-        self.render_mode, self.show_lidar = render_mode, False
+        self.render_mode, self.show_lidar, self.lidar = render_mode, False, lidar
         tasks = list(PILLAR_TASKS) if tasks is None else tasks
         tasks = tasks if isinstance(tasks, (list, tuple)) else [tasks]
         if not tasks:
@@ -279,7 +276,6 @@ class LocoEnv(gymnasium.Env):
         self.generator = TrajectoryGenerator() if tg else None
         self._connect(gui)
         rows, columns = LIDAR_AZIMUTHS.shape
-        self.lidar, self.paper = lidar, tuple(paper)
         self.charted = lidar and "map" not in paper  # is the map shown? Is it drawn, for the guide?
         self.charting = not {"guide", "map"} <= set(paper)
         self.scan_shape = rows * lidar + (len(CHART_RADII) + 1) * self.charted, columns
@@ -316,15 +312,11 @@ class LocoEnv(gymnasium.Env):
             edge += high - low + 2 * LIDAR_RANGE
             self._add_mesh(terrain, self.offsets[-1], visual)
         self._load_robot()
-        self.people = []
-        n_people = max(len(terrain.people) for terrain in self.pool)
-        for _ in range(n_people):
-            size = dict(radius=PERSON_RADIUS, height=PERSON_HEIGHT)
-            shape = p.createCollisionShape(p.GEOM_CYLINDER, **size)
-            looks = -1
-            if visual:
-                size["length"] = size.pop("height")
-                looks = p.createVisualShape(p.GEOM_CYLINDER, rgbaColor=(0.9, 0.5, 0.2, 1), **size)
+        self.people, body = [], dict(shapeType=p.GEOM_CYLINDER, radius=PERSON_RADIUS)
+        for _ in range(max(len(terrain.people) for terrain in self.pool)):
+            shape = p.createCollisionShape(height=PERSON_HEIGHT, **body)
+            looks = p.createVisualShape(length=PERSON_HEIGHT, rgbaColor=(0.9, 0.5, 0.2, 1),
+                                        **body) if visual else -1
             self.people.append(p.createMultiBody(0, shape, looks))
         sources, directions = lidar_rays()
         if visual:
@@ -389,12 +381,13 @@ class LocoEnv(gymnasium.Env):
         if not set(options) <= {"terrain", "route"} or index not in range(len(self.pool)):
             known = f"terrain, in range({len(self.pool)}), and route"
             raise ValueError(f"options may be {known}, got {options}")
-        self.index, self.terrain = index, self.pool[int(index)]
+        self.index, self.terrain = int(index), self.pool[int(index)]
         terrain = self.terrain
-        self.route = route = options.get("route", rng.integers(len(terrain.starts)))
+        route = options.get("route", rng.integers(len(terrain.starts)))
         if route not in range(len(terrain.starts)):
             raise ValueError(f"route must be in range({len(terrain.starts)}), got {route!r}")
-        self.origin = np.array([self.offsets[index], 0.0, 0.0])
+        self.route = route = int(route)
+        self.origin = np.array([self.offsets[self.index], 0.0, 0.0])
         x, y, z, yaw = terrain.starts[route]
         self.goal = (terrain.goals[route] + self.origin + [0, 0, BASE_HEIGHT]).tolist()
         yaw += rng.uniform(-0.5, 0.5)
@@ -480,9 +473,8 @@ class LocoEnv(gymnasium.Env):
         r = p.getMatrixFromQuaternion(quaternion)
         self.position, self.up = position, r[8]
         self.distance = math.dist(self.goal, position)
-        heading = math.atan2(self.goal[1] - position[1], self.goal[0] - position[0])
         self.yaw = math.atan2(r[3], r[0])
-        heading -= self.yaw
+        heading = math.atan2(self.goal[1] - position[1], self.goal[0] - position[0]) - self.yaw
         state = [self.distance, (heading + math.pi) % (2 * math.pi) - math.pi]
         wx, wy, wz = self.rates
         state += [r[i] * wx + r[3 + i] * wy + r[6 + i] * wz for i in range(3)]
@@ -528,8 +520,8 @@ class LocoEnv(gymnasium.Env):
         rgba = p.getCameraImage(width, height, view, projection, lightDirection=(2, 3, 8),
                                 renderer=p.ER_TINY_RENDERER)[2]
         picture = np.reshape(rgba, (height, width, 4))[..., :3].astype(np.uint8)
-        if self.show_lidar:
-            points = np.array([(*hit[3], 1.0) for hit in self.hits if hit[2] < 1])
+        if self.show_lidar and self.lidar:
+            points = np.reshape([(*hit[3], 1.0) for hit in self.hits if hit[2] < 1], (-1, 4))
             matrices = [np.reshape(m, (4, 4)) for m in (view, projection)]  # both transposed
             x, y, _, w = (points @ matrices[0] @ matrices[1]).T
             columns, rows = (1 + x / w) / 2 * width, (1 - y / w) / 2 * height
@@ -539,10 +531,6 @@ class LocoEnv(gymnasium.Env):
                 picture[i[seen], j[seen]] = (220, 30, 30)
         return picture
 
-    def follow(self):
-        """Turns the camera of the window (gui=True) to the robot."""
-        self.bullet.resetDebugVisualizerCamera(2.4, self.view_yaw, -40, self.position)
-
     def mirror(self):
         """The left-right symmetry: mirrored, o becomes o[i] * s and an action a becomes a[j] * t.
 
@@ -550,16 +538,13 @@ class LocoEnv(gymnasium.Env):
             (i, s, j, t): indices and signs over the observation, then over the action.
         """
         legs = np.arange(12).reshape(4, 3)[[1, 0, 3, 2]].ravel()  # joint angles mirror unsigned
-        swap = np.array([1, 0, 3, 2])
+        swap, tg = np.array([1, 0, 3, 2]), bool(self.generator)
         parameters = np.array([0, 2, 1, 3, 4])  # left and right stride change places
         scan = np.arange(self.scan.size).reshape(self.scan_shape)[:, ::-1].ravel()
-        parts = [scan, np.arange(5), legs, legs]
+        parts = [scan, np.arange(5), legs, legs] + [swap, swap, parameters] * tg
+        actions = [parameters] * tg + [legs]
         signs = np.ones(self.observation_space.shape)
         signs[scan.size + np.array([1, 2, 4])] = -1  # heading, roll rate, yaw rate
-        actions = [legs]
-        if self.generator:
-            parts += [swap, swap, parameters]
-            actions = [parameters, legs]
         chain = [np.concatenate([p + sum(map(len, group[:k])) for k, p in enumerate(group)])
                  for group in (parts, actions)]
         return chain[0], signs, chain[1], np.ones(self.action_space.shape)
@@ -651,7 +636,8 @@ def plan(args):
     """The stages of a training: (tasks, difficulties, share of all steps done at its end, settings)
 
     With a guide the policy first does as he does, by large steps that no noise of rewards misleads.
-    Then, and without a guide from the beginning, it learns by PPO.
+    Then, and without a guide from the beginning, it learns by PPO. One task after the other
+    (--sequential), it has no time but for the first.
     """
     eyes = [task for task in args.tasks if task not in BLIND_TASKS] or args.tasks
     # Short rollouts and large steps learn fastest at first; later the noise of so few samples holds
@@ -665,8 +651,9 @@ def plan(args):
     if args.tg and "guide" not in args.paper:
         # Advice has no noise that a trust region would have to guard against.
         follow = dict(guide_share=1.0, update_epochs=3, target_kl=1e9)
-        first |= follow | dict(max_std=0.2) | _constant(1e-3)
-        middle |= follow | dict(max_std=0.15) | _constant(5e-4)
+        rates = "learning_rate", "min_learning_rate", "max_learning_rate"  # whatever the KL
+        first |= follow | dict(max_std=0.2) | dict.fromkeys(rates, 1e-3)
+        middle |= follow | dict(max_std=0.15) | dict.fromkeys(rates, 5e-4)
         last |= dict(guide_share=0.5, min_learning_rate=1e-5, learning_rate=5e-5,
                      max_learning_rate=1e-4)
     if args.sequential:  # one task after the other (section 3), each for as long
@@ -675,11 +662,6 @@ def plan(args):
     ends = np.linspace(start, 0.8, FRESH + 1).tolist()
     return [(args.tasks, (0, 1), start, first), *((eyes, HARD, end, middle) for end in ends[1:]),
             (args.tasks, HARD, 1.0, last)]
-
-
-def _constant(step):
-    """Settings for one step size all the time, whatever the KL."""
-    return dict(learning_rate=step, min_learning_rate=step, max_learning_rate=step)
 
 
 def train(args):
@@ -700,7 +682,8 @@ def train(args):
     noise_correlation = (0.9,) * n_tg + (0.0,) * 12  # 0.3 s: turns and stops are tried as such
     ranks = int(os.environ.get("WORLD_SIZE", 1))
     restarted = os.environ.get("TORCHELASTIC_RESTART_COUNT", "0") != "0"  # torchrun, after a crash
-    resume, on_update = args.resume or restarted, tensorboard(run_dir) if args.tensorboard else None
+    resume, first = args.resume or restarted, int(os.environ.get("RANK", 0)) == 0
+    on_update = tensorboard(run_dir) if args.tensorboard and first else None
     try:
         # Each stage resumes the one before.
         for k, (tasks, difficulty, share, settings) in enumerate(stages):
@@ -717,17 +700,17 @@ def train(args):
                 init_std=init_std, noise_correlation=noise_correlation,
                 gae_lambda=0.98, max_advantage=1.0, **settings,
             )
-            make_env = functools.partial(training_env, seed=args.seed, tasks=tasks,
+            make_env = partial(training_env, seed=args.seed, tasks=tasks,
                                          guide=config.guide_share > 0, stage=k,
                                          difficulty=difficulty, **options)
             learn(make_env, config, run_dir=run_dir, resume=resume, mirror=mirror, meta=meta,
                   episode_keys=("t_cr", "success", "fall", "exploded"), groups=args.tasks,
                   on_update=on_update)
     except KeyboardInterrupt:
-        if int(os.environ.get("RANK", 0)) == 0:
+        if first:
             print(f"\nStopped. To go on from the last checkpoint: {_again(args)}")
         return 130
-    if int(os.environ.get("RANK", 0)) == 0:
+    if first:
         checkpoint = load_checkpoint(run_dir / "checkpoint.pt")
         # To be shared: who acts needs no critic, and half the bits change an action by less than a
         # thousandth.
@@ -737,7 +720,7 @@ def train(args):
                                if not name.startswith("critic.")}
         torch.save(checkpoint, run_dir / "policy.pt")
         if args.stage is None:
-            print(_made(run_dir))
+            print(MADE.format(run_dir))
     return 0
 
 
@@ -757,6 +740,7 @@ def tensorboard(run_dir):
     return on_update
 
 
+MADE = "Policy: {0}/policy.pt   Curve: {0}/curve.png"  # what a person needs of a training
 LOST = 3  # exit code of a rank that ends because another one is gone
 
 
@@ -791,16 +775,12 @@ def launch(args):
         # The launcher ends the other ranks by SIGTERM, and may record that, too.
         killed = [rank for rank, code in codes.items() if code not in (LOST, -signal.SIGTERM)]
         rank = (killed or list(codes))[0]
-        print(f"loco_mtrl.py: error: rank {rank} was killed by signal {-codes[rank]}. "
+        end = f"was killed by signal {-codes[rank]}" if codes[rank] < 0 else "lost the others"
+        print(f"loco_mtrl.py: error: rank {rank} {end}. "
               f"To go on from the last checkpoint: {_again(args)}", file=sys.stderr)
         return 1
-    print(_made(run_dir))
+    print(MADE.format(run_dir))
     return 0
-
-
-def _made(run_dir):
-    """Where a finished training has left what a person needs."""
-    return f"Policy: {run_dir / 'policy.pt'}   Curve: {run_dir / 'curve.png'}"
 
 
 def _again(args):
@@ -858,7 +838,8 @@ REFERENCES = {"zero": zero_action, "straight": walk_straight, "guide": follow_gu
 
 
 def load_actor(name):
-    """(act, options, row): `act(observation, env)`, LocoEnv's options, a row of PAPER or None.
+    """(act, options, row): `act(observation, env)`, LocoEnv's options, the name of its row in
+    PAPER, if it is there.
 
     `name` is a checkpoint's path or one of REFERENCES. Raises as `load_checkpoint` does.
     """
@@ -868,19 +849,14 @@ def load_actor(name):
     meta = checkpoint["meta"]
     if not {"tg", "lidar", "paper", "tasks", "sequential"} <= set(meta):
         raise ValueError(f"{name} is not a policy for LocoEnv: {meta}")
-    options, tasks, row = {k: meta[k] for k in ("tg", "lidar", "paper")}, meta["tasks"], "ours"
+    options, tasks = {k: meta[k] for k in ("tg", "lidar", "paper")}, meta["tasks"]
     with contextlib.closing(LocoEnv("flat", **options)) as env:
         size, given = env.observation_space.shape[0], model.kwargs["obs_dim"]
     if size != given:
         raise ValueError(f"{name} takes observations of {given} numbers, LocoEnv gives {size}")
-    if not meta["tg"]:
-        row = "reactive"
-    elif not meta["lidar"]:
-        row = "no vision"
-    elif meta["sequential"]:
-        row = "sequential"
-    elif len(tasks) == 1:
-        row = tasks[0] if tasks[0] in PAPER else None
+    kinds = {"reactive": not meta["tg"], "no vision": not meta["lidar"],
+             "sequential": meta["sequential"], tasks[0]: len(tasks) == 1, "ours": True}
+    row = next(kind for kind, holds in kinds.items() if holds)
     return lambda observation, env: model.mean_action(observation), options, row
 
 
@@ -904,19 +880,17 @@ def episodes(job):
         env = gymnasium.make("LocoMTRL-v0", tasks=terrain, disable_env_checker=True,
                              max_episode_steps=round(EVAL_SECONDS / DT), **options)
         observation, info = env.reset(seed=seed)
-        ended = False
-        while not ended:
+        terminated = truncated = False
+        while not (terminated or truncated):
             observation, _, terminated, truncated, info = env.step(act(observation, env))
-            ended = terminated or truncated
-        seconds = env.unwrapped.time
-        keys = ("t_cr", "success", "fall", "collisions")
-        results.append({k: float(info[k]) for k in keys} | {"seconds": seconds})
+        result = {k: float(info[k]) for k in ("t_cr", "success", "fall", "collisions")}
+        results.append(result | {"seconds": env.unwrapped.time})
         env.close()
     return job, results
 
 
 def evaluate(actors, places, n_episodes, workers):
-    """Scores of every actor in every place: {place: array (actors, episodes) of dicts}.
+    """Scores of every actor in every place: {place: a list of dicts for each actor}.
 
     Every episode runs in an environment of its own, so the scores do not depend on `workers`.
     """
@@ -952,7 +926,7 @@ def eval_command(args):
     report["mean_t_cr"] = float(np.mean([world["t_cr"] for world in table.values()]))
     lines = [("", list(table)), ("t_cr", [f"{w['t_cr']:.2f}" for w in table.values()]),
              ("+- std", [f"{w['std']:.2f}" for w in table.values()])]
-    if len(set(rows)) == 1 and rows[0] and list(table) == list(WORLDS):
+    if len(set(rows)) == 1 and rows[0] in PAPER and list(table) == list(WORLDS):
         figures = ["0." + figure for figure in PAPER[rows[0]].split()]
         lines += [(f"paper: {rows[0]}", figures[:8]), ("+- std", figures[8:])]
     for key in ("success", "fall", "collisions", "seconds"):
@@ -972,6 +946,7 @@ def eval_command(args):
 
 def draw_map(axis, terrain):
     """Draws a terrain from above: shaded heights, starts (white), goals (green), people's ways."""
+    from matplotlib import colormaps
     from matplotlib.colors import LightSource
 
     low, high = terrain.vertices[:, :2].min(0), terrain.vertices[:, :2].max(0)
@@ -979,23 +954,13 @@ def draw_map(axis, terrain):
     z = terrain.height(*np.meshgrid(x, y))
     z = np.where(np.isfinite(z), z, np.nanmin(z[np.isfinite(z)]))
     span = dict(vmin=min(z.min(), -0.5), vmax=max(z.max(), 0.5))
-    shaded = LightSource(315, 40).shade(z, axis.figure.colormap, blend_mode="soft", **span)
+    shaded = LightSource(315, 40).shade(z, colormaps["cividis"], blend_mode="soft", **span)
     axis.imshow(shaded, origin="lower", extent=(low[0], high[0], low[1], high[1]))
     for person in terrain.people:
         axis.plot(*person.path.T, color="tab:orange", lw=0.8)
     axis.plot(*terrain.starts[:, :2].T, "wo", ms=4, mec="k")
     axis.plot(*terrain.goals[:, :2].T, "o", color="tab:green", ms=4, mec="k")
     axis.set(xticks=[], yticks=[])
-
-
-def _figure(**options):
-    """A matplotlib figure that needs no display."""
-    from matplotlib import colormaps
-    from matplotlib.figure import Figure
-
-    figure = Figure(layout="constrained", **options)
-    figure.colormap = colormaps["cividis"]
-    return figure
 
 
 def play(args):
@@ -1008,30 +973,31 @@ def play(args):
     options |= {"gui": True} if args.gui else {"render_mode": "rgb_array"}
     env = gymnasium.make("LocoMTRL-v0", tasks=terrain, disable_env_checker=True,
                          max_episode_steps=round(EVAL_SECONDS / DT), **options)
-    env.unwrapped.show_lidar = args.lidar
+    robot = env.unwrapped
+    robot.show_lidar = args.lidar
     observation, info = env.reset(seed=args.seed)
-    frames, path, ended = [], [], False
+    frames, path, terminated, truncated = [], [], False, False
     with tqdm(total=EVAL_SECONDS, unit="s", bar_format="{l_bar}{bar}|{n:.0f}/{total} s") as bar:
-        while not ended:
+        while not (terminated or truncated):
             if args.gui:
-                env.unwrapped.follow()
+                robot.bullet.resetDebugVisualizerCamera(2.4, robot.view_yaw, -40, robot.position)
                 time.sleep(DT)
             elif len(path) % GIF_EVERY == 0:
                 frames.append(env.render())
-            path.append(np.array(env.unwrapped.position) - env.unwrapped.origin)
+            path.append(robot.position - robot.origin)
             observation, _, terminated, truncated, info = env.step(act(observation, env))
-            ended = terminated or truncated
             bar.update(DT)
     end = "reached the goal" if info["success"] else "fell" if info["fall"] else "ran out of time"
     print(f"{terrain.name}: t_cr {info['t_cr']:.2f}, {end} after {len(path) * DT:.1f} s")
     if not args.gui:
+        from matplotlib.figure import Figure  # not pyplot: it needs no display
         from PIL import Image
 
         palette = Image.fromarray(np.concatenate(frames[:: len(frames) // 8 + 1])).quantize(64)
         pictures = [Image.fromarray(frame).quantize(palette=palette, dither=0) for frame in frames]
         pictures[0].save(args.gif, save_all=True, append_images=pictures[1:], loop=0,
                          duration=round(1000 * GIF_EVERY * DT))
-        figure = _figure(figsize=(6, 5))
+        figure = Figure(figsize=(6, 5), layout="constrained")
         axis = figure.subplots()
         draw_map(axis, terrain)
         axis.plot(*np.array(path)[:, :2].T, color="tab:red")
@@ -1045,8 +1011,10 @@ def play(args):
 
 def gallery(args):
     """`gallery`: every training task and every unseen world from above, in one picture."""
+    from matplotlib.figure import Figure
+
     Path(args.out).touch()  # as in play
-    figure = _figure(figsize=(15, 11))
+    figure = Figure(figsize=(15, 11), layout="constrained")
     names = [*PILLAR_TASKS, *WORLDS]
     axes = figure.subplots(-(-len(names) // 7), 7).ravel()
     for axis in axes[len(names) :]:
@@ -1064,27 +1032,21 @@ def gallery(args):
 # ------------------------------------------------------------------------------- command line
 
 
-def _names(valid, what):
-    def parse(text):
-        names = text.split(",")
-        for name in names:
-            if name not in valid:
-                known = ", ".join(valid)
-                raise argparse.ArgumentTypeError(f"unknown {what} {name!r}; valid: {known}")
-        return names
-
-    return parse
+def _names(valid, what, text):
+    names = text.split(",")
+    for name in names:
+        if name not in valid:
+            known = ", ".join(valid)
+            raise argparse.ArgumentTypeError(f"unknown {what} {name!r}; valid: {known}")
+    return names
 
 
-def _whole(least):
-    def parse(text):
-        value = float(text) if text.replace(".", "").replace("e", "").isdigit() else -1.0
-        if value < least or value % 1 != 0:
-            known = f"a whole number of at least {least}"
-            raise argparse.ArgumentTypeError(f"must be {known}, got {text!r}")
-        return int(value)
-
-    return parse
+def _whole(least, text):
+    value = float(text) if text.replace(".", "").replace("e", "").isdigit() else -1.0
+    if value < least or value % 1 != 0:
+        known = f"a whole number of at least {least}"
+        raise argparse.ArgumentTypeError(f"must be {known}, got {text!r}")
+    return int(value)
 
 
 def mesh_options(p):
@@ -1097,26 +1059,27 @@ def parse(argv):
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     parser = argparse.ArgumentParser("loco_mtrl.py", description=__doc__.split("\n")[0])
     commands = parser.add_subparsers(dest="command")
-    places = _names([*WORLDS, *PILLAR_TASKS], "world")
+    places = partial(_names, [*WORLDS, *PILLAR_TASKS], "world")
+    natural, positive = partial(_whole, 0), partial(_whole, 1)
 
     p = commands.add_parser("train", help="train a policy")
-    p.add_argument("--steps", type=_whole(1), default=MAIN_STEPS, help="of the environment, in all")
-    p.add_argument("--tasks", type=_names(PILLAR_TASKS, "task"), default=list(PILLAR_TASKS),
-                   help="comma-separated; default: all %(default)s")
+    p.add_argument("--steps", type=positive, default=MAIN_STEPS, help="of the environment, in all")
+    p.add_argument("--tasks", type=partial(_names, PILLAR_TASKS, "task"),
+                   default=list(PILLAR_TASKS), help="comma-separated; default: all %(default)s")
     p.add_argument("--no-tg", dest="tg", action="store_false", help="reactive policy")
     p.add_argument("--no-lidar", dest="lidar", action="store_false", help="blind policy")
-    p.add_argument("--paper", type=_names(OURS, "part"), nargs="?", const=list(OURS), default=[],
-                   metavar="PARTS",
+    p.add_argument("--paper", type=partial(_names, OURS, "part"), nargs="?", const=list(OURS),
+                   default=[], metavar="PARTS",
                    help="state and training as in the paper, without what is ours: a guide who "
                    "shows the way in training, and the robot's map; or only without those named "
                    f"({','.join(OURS)})")
     p.add_argument("--sequential", action="store_true", help="one task after the other, not mixed")
-    p.add_argument("--seed", type=_whole(0), default=0)
+    p.add_argument("--seed", type=natural, default=0)
     p.add_argument("--run-dir", default="runs/main", help="(default %(default)s)")
     p.add_argument("--resume", action="store_true", help="go on from the run's checkpoint")
     p.add_argument("--tensorboard", action="store_true", help="log for TensorBoard, too")
-    p.add_argument("--ranks", type=_whole(1), default=cores, help="processes; default: every core")
-    p.add_argument("--stage", type=_whole(0), help=argparse.SUPPRESS)  # see launch
+    p.add_argument("--ranks", type=positive, default=cores, help="processes; default: every core")
+    p.add_argument("--stage", type=natural, help=argparse.SUPPRESS)  # see launch
     p.set_defaults(run=train)
 
     p = commands.add_parser("eval", help="score policies in worlds they never saw")
@@ -1125,17 +1088,17 @@ def parse(argv):
     p.add_argument("--worlds", type=places, default=list(WORLDS),
                    help="comma-separated worlds, or training tasks on held-out seeds")
     mesh_options(p)
-    p.add_argument("--episodes", type=_whole(1), default=20, help="per world (default %(default)s)")
+    p.add_argument("--episodes", type=positive, default=20, help="per world (default %(default)s)")
     p.add_argument("--json", metavar="FILE", help="write the scores there, too")
-    p.add_argument("--ranks", type=_whole(1), default=cores, help="processes; default: every core")
+    p.add_argument("--ranks", type=positive, default=cores, help="processes; default: every core")
     p.set_defaults(run=eval_command)
 
     p = commands.add_parser("play", help="watch a policy for one episode")
     p.add_argument("policy", metavar="POLICY", help="as in eval")
-    p.add_argument("--world", type=lambda text: places(text)[0], default="maze",
+    p.add_argument("--world", choices=[*WORLDS, *PILLAR_TASKS], metavar="WORLD", default="maze",
                    help="a world or a training task (default %(default)s)")
     mesh_options(p)
-    p.add_argument("--seed", type=_whole(0), default=EVAL_SEED, help="layout (default %(default)s)")
+    p.add_argument("--seed", type=natural, default=EVAL_SEED, help="layout (default %(default)s)")
     p.add_argument("--gif", metavar="FILE", default="play.gif", help="(default %(default)s)")
     p.add_argument("--lidar", action="store_true", help="draw where the LiDAR's rays hit")
     p.add_argument("--gui", action="store_true", help="PyBullet's window instead of a GIF")
@@ -1143,7 +1106,7 @@ def parse(argv):
 
     p = commands.add_parser("gallery", help="draw all terrains in one picture")
     p.add_argument("--out", metavar="FILE.png", default="gallery.png", help="(default %(default)s)")
-    p.add_argument("--seed", type=_whole(0), default=0)
+    p.add_argument("--seed", type=natural, default=0)
     p.set_defaults(run=gallery)
 
     args = parser.parse_args(argv)

@@ -160,19 +160,12 @@ def flip(x, index, sign):
 class ActorCritic(nn.Module):
     """A Gaussian policy, a value function, and the normaliser of the observations they share.
 
-    Args:
-        obs_dim, act_dim: lengths of the flat observation and action.
-        exteroceptive: rows and columns of the scan (row by row) that leads the observation and has
-            an encoder of its own; (0, 0): none.
-        init_std: standard deviation of the exploration noise, the same in every state: a number,
-            or one for each entry of the action.
-        mirror: None, or (obs_index, obs_sign, act_index, act_sign): the left-right mirror image of
-            an observation o is `o[obs_index] * obs_sign`, and likewise for an action. The networks
-            then see both o, with 1 appended, and its image, with -1, and their outputs are
-            averaged: without that number the policy would be equivariant by construction,
-            mean(mirror(o)) = mirror(mean(o)), and before a wall that is as wide on the left as on
-            the right stand for ever; with it, it learns once for both sides and may prefer one.
-            (Mirrored samples as more data would be off-policy: their ratios run away.)
+    exteroceptive, init_std, the hidden widths: see PPOConfig. mirror: None, or (obs_index,
+    obs_sign, act_index, act_sign): the left-right mirror image of an observation o is
+    `o[obs_index] * obs_sign`, and likewise for an action. The networks see o, with 1 appended,
+    and its image, with -1, and their outputs are averaged. So what is learned for one side is
+    known for the other; and thanks to the number appended the policy may still prefer a side,
+    as it must before a wall that is as wide on the left as on the right.
 
     Raises ValueError if the scan exceeds the observation, the mirror is not its own inverse, or
     init_std has another length than the action.
@@ -234,9 +227,6 @@ class ActorCritic(nn.Module):
         out = (out[0] + flip(out[1], *self.flip_act)) / 2 if self.flip_act else out[0]
         return out.tanh()
 
-    def _value(self, views):
-        return self.critic(views).mean((-2, -1))
-
     def mean(self, obs):
         """Mean of the policy, in (-1, 1): (..., obs) -> (..., act).
 
@@ -257,7 +247,7 @@ class ActorCritic(nn.Module):
 
     def value(self, obs):
         """Expected discounted return: (..., obs) -> (...)."""
-        return self._value(self.views(obs))
+        return self.critic(self.views(obs)).mean((-2, -1))
 
     def _log_density(self, noise):
         """Log-density of the action that `noise` standard deviations off the mean are: (...)."""
@@ -270,7 +260,7 @@ class ActorCritic(nn.Module):
         """
         mean = self._mean(views)
         noise = (actions - mean) / self.log_std().exp()
-        return self._log_density(noise), self._value(views), mean
+        return self._log_density(noise), self.critic(views).mean((-2, -1)), mean
 
     @torch.no_grad()
     def act(self, obs, noise):
@@ -516,8 +506,7 @@ def draw_curve(run_dir, *names):
 
 
 def learn(make_env, config, *, run_dir=None, resume=False, mirror=None,
-          episode_keys=("t_cr", "success", "fall"), group_key="task", groups=(), meta=None,
-          on_update=None):
+          episode_keys=("t_cr", "success", "fall"), groups=(), meta=None, on_update=None):
     """Train on `make_env` until config.total_timesteps; returns the ActorCritic.
 
     Args:
@@ -528,7 +517,7 @@ def learn(make_env, config, *, run_dir=None, resume=False, mirror=None,
         resume: go on from run_dir's checkpoint, with its network and its mirror.
         mirror: see ActorCritic.
         episode_keys: what to average from the info of an episode's last step; the first of them
-            also for each of `groups`, the values of info[group_key]. progress.csv has the means
+            also for each of `groups`, the values of info["task"]. progress.csv has the means
             over each rank's last 100 episodes, NaN where there is none.
         meta: plain dict kept in the checkpoint and in config.json.
         on_update: called on rank 0 after every update as on_update(model, row of progress.csv).
@@ -545,13 +534,11 @@ def learn(make_env, config, *, run_dir=None, resume=False, mirror=None,
     does not fit, FloatingPointError if the parameters stop being numbers, and what `open_run`
     raises.
     """
-    for name, good, valid in (
-        ("resume", not resume or run_dir is not None, "False where there is no run_dir"),
-        ("episode_keys", not isinstance(episode_keys, str), "several names"),
-        ("groups", not isinstance(groups, str), "several names"),
-    ):
-        if not good:
-            raise ValueError(f"{name} = {locals()[name]!r}, but it must be {valid}")
+    if resume and run_dir is None:
+        raise ValueError("resume = True, but there is no run_dir to go on from")
+    for names in (episode_keys, groups):
+        if isinstance(names, str):
+            raise ValueError(f"episode_keys and groups must be several names, but got {names!r}")
     torch.set_num_threads(1)  # nets this small only lose by more
     if int(os.environ.get("WORLD_SIZE", 1)) > 1 and not dist.is_initialized():
         # An optimiser would import it later, when it would keep hold of the open group for good.
@@ -667,8 +654,8 @@ def learn(make_env, config, *, run_dir=None, resume=False, mirror=None,
                 returned += reward
                 for i in np.flatnonzero(ended):
                     episode = {k: float(info[k][i]) for k in episode_keys if k in info}
-                    for k in episode_keys[:1] if group_key in info else ():
-                        episode[f"{k}/{info[group_key][i]}"] = episode.get(k, math.nan)
+                    for k in episode_keys[:1] if "task" in info else ():
+                        episode[f"{k}/{info['task'][i]}"] = episode.get(k, math.nan)
                     episodes.append({"return": returned[i], **episode})
                 returned[ended] = 0
             obs[-1] = torch.from_numpy(next_obs).flatten(1)

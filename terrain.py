@@ -8,7 +8,6 @@ Frame: x runs along the m pillars from 0, y along the n pillars with 0 in the mi
 lengths are in metres and all angles in radians unless a name says otherwise.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
@@ -115,7 +114,7 @@ class Terrain:
     triangles: np.ndarray  # (F, 3) int, counter-clockwise seen from outside
     starts: np.ndarray  # (K, 4) x, y, ground z, yaw
     goals: np.ndarray  # (K, 3) x, y, ground z
-    height: Callable  # height(x, y) -> ground z, arrays or scalars; -inf outside
+    height: Ground  # height(x, y) -> ground z, arrays or scalars; -inf outside
     people: tuple[Person, ...] = ()
 
 
@@ -143,15 +142,13 @@ def _runs(*layers):
     new = np.ones(layers[0].shape, bool)
     new[:, 1:] = np.any([a[:, 1:] != a[:, :-1] for a in layers], axis=0)
     row, first = np.nonzero(new)
-    last = np.r_[first[1:], 0]
+    last = np.roll(first, -1)
     return row, first, np.where(last == 0, layers[0].shape[1], last)
 
 
 def _walls(heights):
     """Walls between rows i and i + 1: x index, first and last y index, z behind, z ahead."""
     behind, ahead = heights[:-1], heights[1:]
-    if not behind.size:
-        return (np.zeros(0, int),) * 5
     i, j0, j1 = _runs(behind, ahead)
     z0, z1 = behind[i, j0], ahead[i, j0]
     return tuple(a[z0 != z1] for a in (i + 1, j0, j1, z0, z1))
@@ -290,10 +287,10 @@ def _routes(ground, rng, count, reach, climb=CLIMB, zones=((0, np.inf),), margin
 
 
 def _cost(z, free):
-    """Chart.cost of squares: 1 a metre where all is level and `free` for another 0.4 m around.
+    """Chart.cost of squares: 1 a metre where all is level and `free` for three squares around.
 
-    It is up to 9 beside what is not free, and 50 there; and 1 more for each tenth of slope above
-    0.2. Where z is NaN nothing is known of slopes, nor paid for them.
+    It is 5.5 beside what is not free, and 50 there; and 1 more for each tenth of slope above 0.2.
+    Where z is NaN nothing is known of slopes, nor paid for them.
     """
     near, rings = ~free, round(0.4 / CHART)
     inside = np.zeros(free.shape, np.float32)  # how many of the rings around what is not free
@@ -333,7 +330,7 @@ class Chart:
         at = (2 * np.arange(self.size // 2)[:, None] + self.corner + 1) * CHART
         self.left = np.hypot(at[:, :1] - goal[0], at[:, 1] - goal[1]).astype(np.float32)
         self.goal = tuple(k // 2 for k in self._squares(*goal[:2]))
-        self.least = self.left[self.goal]  # 0, but for a goal beyond the map
+        self.least = self.left[self.goal]  # nearly 0, but for a goal beyond the map
 
     def _squares(self, x, y):
         i, j = (np.floor(c / CHART).astype(int) - low
@@ -729,14 +726,10 @@ def waves(rng, difficulty):
 for _task in (obstacles, poles, corridors, walls, rooms, mazes, screens, traps):
     _task.fence = True  # walls all around: who looks for a way must not fall off the world
 
-PILLAR_TASKS = {
-    task.__name__: task
-    for task in (
-        flat, rugged, holes, obstacles, poles, stairs, stones, slopes, hills, pyramids_up,
-        pyramids_down, gaps, hurdles, ridges, pits, coasts, corridors, walls, rooms, mazes,
-        screens, traps, blocks, waves, crags,
-    )
-}
+PILLAR_TASKS = {task.__name__: task for task in (
+    flat, rugged, holes, obstacles, poles, stairs, stones, slopes, hills, pyramids_up,
+    pyramids_down, gaps, hurdles, ridges, pits, coasts, corridors, walls, rooms, mazes,
+    screens, traps, blocks, waves, crags)}
 
 
 def make_terrain(task, rng, difficulty):
@@ -774,8 +767,7 @@ def make_terrain(task, rng, difficulty):
             # Some begin with their back to the goal: what lies behind it is worth a look, too.
             yaw = routes[0][2::3, 3]
             yaw += rng.uniform(-np.pi, np.pi, len(yaw))
-            mesh = fuse_pillars(heights, cell, cell)
-            return Terrain(name, *mesh, *routes, ground)
+            return Terrain(name, *fuse_pillars(heights, cell, cell), *routes, ground)
     raise ValueError(f"task {name!r} gave no walkable route in {TRIES} draws of {heights.shape}")
 
 
@@ -886,7 +878,7 @@ def _plan_of(nodes, cell, shape):
 def _smooth(rng, size, cell, coarse, octaves, degrees):
     """Nodes of a fractal surface over `size` m, scaled so that 5 % of it is steeper than `degrees`.
 
-    A level spot of 0.7 m radius, eased into the slope, is made at its low end to start from.
+    A level spot of 0.9 m radius, eased into the slope, is made where x is small to start from.
     """
     shape = tuple(round(s / cell) + 1 for s in size)
     nodes = sum(_noise(rng, shape, tuple(c * 2**k + 1 for c in coarse)) / 2.6**k
@@ -969,7 +961,7 @@ def _doorway(rng, plan, line, a, b):
 
 
 def _corridor_plan(rng):
-    """Rooms of 2.8-4.4 m on both sides of a corridor 1.6 m wide: 14 x 9.6 m. Walls, then rooms."""
+    """Rooms 2.8-7.2 m long beside a corridor 1.6 m wide: 14 x 9.6 m. Returns walls and rooms."""
     plan, rooms = np.zeros((141, 97)), []
     plan[[0, -1]], plan[:, [0, -1]] = CLOSED, CLOSED
     for wall, low, high in ((40, 0, 40), (57, 57, 96)):  # the corridor's sides, in FINE cells
@@ -1006,15 +998,14 @@ def _open_plan(rng):
     return plan, [(1, 120, 1, 120)] * 6 + [(1, a, 1, b), (122 - c, 120, 122 - d, 120)]
 
 
-def _furnish(rng, plan, rooms):
+def _furnish(rng, bare, rooms):
     """Puts a cupboard, desks and their chairs into each room where nothing stands.
 
     Cupboards 0.4 x 0.8 x 1.8 m stay part of the walls' plan; desks 0.7 x 1.4 m, 0.75 m high on four
-    legs, and chairs 0.45 m square, seat at 0.45 m, are boxes: the LiDAR looks through below them.
+    legs, and chairs 0.4 m square, seat at 0.45 m, are boxes: the LiDAR looks through below them.
     Returns the plan with all tops in it, the plan without desks and chairs, and the boxes.
     """
-    bare, boxes = plan, []
-    plan = plan.copy()
+    plan, boxes = bare.copy(), []
 
     def place(i, j, a, b, height):
         around = plan[max(i - 1, 0) : i + a + 1, max(j - 1, 0) : j + b + 1]
@@ -1023,12 +1014,12 @@ def _furnish(rng, plan, rooms):
         plan[i : i + a, j : j + b] = height
         return True
 
-    def slab(i, j, a, b, z, legs):
+    def slab(i, j, a, b, z):
         x0, y0 = i * FINE, (j - plan.shape[1] / 2) * FINE
         x1, y1 = x0 + a * FINE, y0 + b * FINE
         boxes.append((x0, x1, y0, y1, z - 0.04, z))
         boxes.extend((x, x + 0.05, y, y + 0.05, 0, z - 0.04)
-                     for x in (x0, x1 - 0.05) for y in (y0, y1 - 0.05) if legs)
+                     for x in (x0, x1 - 0.05) for y in (y0, y1 - 0.05))
 
     for i0, i1, j0, j1 in rooms:
         i, j = rng.integers(i0 + 1, i1 - 5), rng.integers(j0 + 1, j1 - 9)
@@ -1041,10 +1032,10 @@ def _furnish(rng, plan, rooms):
             a, b = (14, 7) if turned else (7, 14)
             if not place(i, j, a, b, 0.75):
                 continue
-            slab(i, j, a, b, 0.75, legs=True)
+            slab(i, j, a, b, 0.75)
             i, j = (i + 5, j + b + 1) if turned else (i + a + 1, j + 5)
             if place(i, j, 4, 4, 0.9):
-                slab(i, j, 4, 4, 0.45, legs=True)
+                slab(i, j, 4, 4, 0.45)
                 x, y = i * FINE, (j - plan.shape[1] / 2) * FINE
                 boxes.append((x, x + 0.4, y + 0.35, y + 0.4, 0.45, 0.9))
     return plan, bare, boxes
@@ -1121,14 +1112,14 @@ def _read_obj(path):
     return np.array(vertices).reshape(-1, 3), np.array(triangles)
 
 
-def _columns(vertices, triangles, x0, y0, shape):
-    """Where vertical rays through the centres of CELL cells meet the triangles.
+def _columns(vertices, triangles, shape):
+    """Where vertical rays through the centres of `shape` CELL cells meet the triangles.
 
     Returns cell indices i, j, heights z (m), all (H,), sorted by cell, then from below.
     """
     a, b, c = (vertices[triangles[:, k]] for k in range(3))
     corners = np.stack([a, b, c])[..., :2]
-    origin = np.array([x0, y0])
+    origin = np.array([0.0, -shape[1] * CELL / 2])
     low = np.ceil((corners.min(0) - origin) / CELL - 0.5).astype(int).clip(0, shape)
     high = np.floor((corners.max(0) - origin) / CELL - 0.5).astype(int) + 1
     wide = np.maximum(high.clip(0, shape) - low, 0)
@@ -1151,7 +1142,7 @@ def load_mesh(path, scale=1.0, up="z"):
     """A scanned building as a Terrain (paper section 3 takes its offices from Gibson).
 
     The floor is the most common height with HEADROOM above it, found by vertical rays; the route
-    is the longest found on it, up to 12 m. The mesh is moved: x from 0, y around 0.
+    one of 9 to 12 m on it, or as long as is found. The mesh is moved: x from 0, y around 0.
 
     path: a Wavefront .obj file. scale: metres a unit. up: "z" or "y", the file's upward axis.
     Raises FileNotFoundError, or ValueError for a bad scale or axis, a file that is no mesh or an
@@ -1176,28 +1167,21 @@ def load_mesh(path, scale=1.0, up="z"):
     middle, half = (low + high) / 2, np.minimum((high - low) / 2, WINDOW / 2)
     shape = np.maximum(np.ceil(2 * half / CELL).astype(int), 3)
     vertices = vertices - [middle[0] - half[0], middle[1], 0]
-    i, j, z = _columns(vertices, triangles, 0.0, -shape[1] * CELL / 2, shape)
+    i, j, z = _columns(vertices, triangles, shape)
     above = np.append(z[1:], np.inf)
     above[np.append((np.diff(i) != 0) | (np.diff(j) != 0), True)] = np.inf
     floor = above - z >= HEADROOM
     i, j, z = i[floor], j[floor], z[floor]
-    for level in _levels(z):
-        plan = np.full(shape, -np.inf)
+    bins, counts = np.unique(np.round(z / 0.1), return_counts=True)
+    for level in bins[np.argsort(-counts)][:5] * 0.1:  # floors, the most common first
+        plan = np.full(shape, z.min() - 10)
         order = np.argsort(-np.abs(z - level), kind="stable")  # the nearest is written last
         plan[i[order], j[order]] = z[order]
-        plan = np.where(np.isfinite(plan), plan, z.min() - 10)
         ground = Ground(plan, (CELL, CELL))
         rng = np.random.default_rng(0)
-        for least in (9, 6, 4, 2, 1):
-            for _ in range(5):
-                # Where there is no floor the plan lies far below: nobody starts or ends there.
-                routes = _routes(ground, rng, 1, (least, 12), floor=z.min())
-                if routes:
-                    return Terrain(Path(path).stem, vertices, triangles, *routes, ground)
+        for least in np.repeat((9, 6, 4, 2, 1), 5):
+            # Where there is no floor the plan lies far below: nobody starts or ends there.
+            routes = _routes(ground, rng, 1, (least, 12), floor=z.min())
+            if routes:
+                return Terrain(Path(path).stem, vertices, triangles, *routes, ground)
     raise ValueError(f"{path} has no floor to walk on: is scale {scale}, or up {up!r}, right?")
-
-
-def _levels(z):
-    """Heights of floors, the most common first."""
-    bins, counts = np.unique(np.round(z / 0.1), return_counts=True)
-    return bins[np.argsort(-counts)][:5] * 0.1

@@ -12,14 +12,8 @@ import numpy as np
 LEGS = ("FR", "FL", "RR", "RL")
 SIDE = np.array([-1.0, 1.0, -1.0, 1.0])  # +1 on the left; abduction moves a foot outwards
 # Read off laikago_toes_zup.urdf (metres, radians).
-HIP_POSITION = np.array(
-    [
-        [0.199095, -0.0817145, -0.03],
-        [0.199095, 0.0817145, -0.03],
-        [-0.238195, -0.0817145, -0.03],
-        [-0.238195, 0.0817145, -0.03],
-    ]
-)  # of the abduction joints, in the frame of the base
+# Of the abduction joints, in the frame of the base.
+HIP_POSITION = np.c_[np.repeat([0.199095, -0.238195], 2), 0.0817145 * SIDE, np.full(4, -0.03)]
 LATERAL = np.array([-0.032875, 0.035165, -0.032875, 0.035165])  # leg plane from abduction axis
 _SIDE, _LATERAL = SIDE.tolist(), LATERAL.tolist()
 UPPER, LOWER = 0.252234, 0.250966  # lengths of the links
@@ -27,15 +21,7 @@ HIP_ZERO, KNEE_ZERO = 0.598933, -0.511159  # angle of the straight link minus th
 
 
 def foot_position(joints):
-    """Forward kinematics of all four legs.
-
-    Args:
-        joints: (..., 12) joint angles, rad.
-    Returns:
-        (..., 4, 3) feet in their hip frames, m.
-    Raises:
-        ValueError: if the last axis is not 12 long.
-    """
+    """Forward kinematics: joints (..., 12), rad, to feet (..., 4, 3) in their hip frames, m."""
     joints = np.asarray(joints, dtype=np.float64)
     if joints.ndim == 0 or joints.shape[-1] != 12:
         raise ValueError(f"joints must have shape (..., 12), got {joints.shape}")
@@ -50,16 +36,10 @@ def foot_position(joints):
 
 
 def joint_angles(feet):
-    """Inverse kinematics of all four legs in closed form, knees bent backwards.
+    """Inverse kinematics in closed form, knees bent backwards: undoes `foot_position`.
 
-    A foot out of reach is clamped: the leg points at it, stretched straight (or folded).
-
-    Args:
-        feet: (..., 4, 3) feet in their hip frames, m.
-    Returns:
-        (..., 12) joint angles, rad; always finite for finite feet.
-    Raises:
-        ValueError: if the last axes are not (4, 3).
+    A foot out of reach is clamped: the leg points at it, stretched straight (or folded), so that
+    finite feet always give finite angles.
     """
     feet = np.asarray(feet, dtype=np.float64)
     if feet.shape[-2:] != (4, 3):
@@ -128,15 +108,10 @@ class TrajectoryGenerator:
         self.scaled, self.parameters = [0.0] * len(PARAMETERS), CENTRE.tolist()
 
     def step(self, action, dt):
-        """Advances the phase by `dt` seconds under new parameters.
+        """Joint targets (12,), rad, `dt` s later, under the parameters that `action` sets.
 
-        Args:
-            action: (5,) in [-1, 1], in the order of PARAMETERS; clipped to that range.
-            dt: s, at least 0.
-        Returns:
-            u_tg: (12,) joint targets, rad.
-        Raises:
-            ValueError: if `action` has another shape or is not finite, or dt is not a time.
+        action: (5,) in [-1, 1], in the order of PARAMETERS; clipped to that range.
+        Raises ValueError if it has another shape or is not finite, or dt is not a time.
         """
         action = np.asarray(action, dtype=np.float64)
         if action.shape != CENTRE.shape or not math.isfinite(sum(action.tolist())):

@@ -189,6 +189,13 @@ def test_a_person_presses_nobody_through_a_wall():
         assert loco_mtrl.PUSH < max(force) < 5000
 
 
+def test_a_blind_robot_has_no_rays_to_draw():
+    with closing(LocoEnv("flat", lidar=False, render_mode="rgb_array")) as env:
+        env.show_lidar = True
+        env.reset(seed=0)
+        assert env.render().shape == (300, 400, 3)
+
+
 def test_lidar_never_sees_the_robot(flat):
     """The scan stays that of the plane with a leg stretched out right before the sensor."""
     flat.reset(seed=0)

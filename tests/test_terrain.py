@@ -318,7 +318,7 @@ def test_a_metre_costs_more_on_slopes_and_beside_what_is_not_free():
         assert terrain._cost(slope * x, free)[10:50, 10:50] == pytest.approx(cost, rel=1e-3)
     free[:, :28] = free[:, 33:] = False  # a lane, five cells of 0.1 m wide
     cost = terrain._cost(0 * x, free)
-    # Its middle is the third cell from what is blocked; from the fifth on there would be no charge.
+    # Its middle is the third cell from what is blocked; from the fourth on there is no charge.
     assert cost[25, 30] == pytest.approx(1 + 8 * (1 - 3 / 4) ** 2, rel=1e-3)
     assert cost[25, 27] == 50
 
