@@ -250,6 +250,8 @@ class LocoEnv(gymnasium.Env):
         pool_seed: seeds the pool; `reset(seed=...)` seeds all else.
         render_mode: None or "rgb_array".
         gui: open PyBullet's window; it allows one in a process.
+
+    Raises ValueError for any argument out of range, naming it and what is valid.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": round(1 / DT)}
@@ -276,8 +278,8 @@ class LocoEnv(gymnasium.Env):
         self.generator = TrajectoryGenerator() if tg else None
         self._connect(gui)
         rows, columns = LIDAR_AZIMUTHS.shape
-        self.charted = lidar and "map" not in paper  # is the map shown? Is it drawn, for the guide?
-        self.charting = not {"guide", "map"} <= set(paper)
+        self.charted = lidar and "map" not in paper  # the robot observes its map
+        self.charting = not {"guide", "map"} <= set(paper)  # it draws one, at least for the guide
         self.scan_shape = rows * lidar + (len(CHART_RADII) + 1) * self.charted, columns
         n_scan = math.prod(self.scan_shape)
         self.scan = np.zeros(n_scan, np.float32)
@@ -568,15 +570,15 @@ PACE = 0.21  # m, the guide's stride where his way is straight
 def advise(env):
     """What a guide would do: take the cheapest of the ways that the robot's own map shows.
 
-    On a slope he crouches. Returns an action, NaN for all but two strides and the stance height:
-    (n_act,).
+    Without a map he heads for the goal; on a slope he crouches. Returns an action (n_act,), NaN for
+    all but two strides and the stance height.
     """
     advice = np.full(env.action.shape, np.nan)
     if env.exploded:
         return advice
     (x, y, _), (to_x, to_y, _) = env.position, env.goal
     turn = math.remainder(math.atan2(to_y - y, to_x - x) - env.yaw, 2 * math.pi)
-    if env.distance > 0.7:
+    if env.charting and env.distance > 0.7:
         turn = _LINES[env.whole.argmin()]
     # The strides: slower in a bend, on the spot where the way lies to the side or behind.
     forward = PACE * max(0.0, math.cos(turn)) ** 2
@@ -700,9 +702,8 @@ def train(args):
                 init_std=init_std, noise_correlation=noise_correlation,
                 gae_lambda=0.98, max_advantage=1.0, **settings,
             )
-            make_env = partial(training_env, seed=args.seed, tasks=tasks,
-                                         guide=config.guide_share > 0, stage=k,
-                                         difficulty=difficulty, **options)
+            make_env = partial(training_env, seed=args.seed, tasks=tasks, stage=k,
+                               guide=config.guide_share > 0, difficulty=difficulty, **options)
             learn(make_env, config, run_dir=run_dir, resume=resume, mirror=mirror, meta=meta,
                   episode_keys=("t_cr", "success", "fall", "exploded"), groups=args.tasks,
                   on_update=on_update)

@@ -21,7 +21,10 @@ HIP_ZERO, KNEE_ZERO = 0.598933, -0.511159  # angle of the straight link minus th
 
 
 def foot_position(joints):
-    """Forward kinematics: joints (..., 12), rad, to feet (..., 4, 3) in their hip frames, m."""
+    """Forward kinematics: joints (..., 12), rad, to feet (..., 4, 3) in their hip frames, m.
+
+    Raises ValueError if the last axis is not 12 long.
+    """
     joints = np.asarray(joints, dtype=np.float64)
     if joints.ndim == 0 or joints.shape[-1] != 12:
         raise ValueError(f"joints must have shape (..., 12), got {joints.shape}")
@@ -36,10 +39,11 @@ def foot_position(joints):
 
 
 def joint_angles(feet):
-    """Inverse kinematics in closed form, knees bent backwards: undoes `foot_position`.
+    """Inverse kinematics in closed form: feet (..., 4, 3), m, to joints (..., 12), rad.
 
-    A foot out of reach is clamped: the leg points at it, stretched straight (or folded), so that
-    finite feet always give finite angles.
+    Undoes `foot_position`, knees bent backwards. A foot out of reach is clamped: the leg points at
+    it, stretched straight (or folded), so that finite feet always give finite angles. Raises
+    ValueError if the last axes are not (4, 3).
     """
     feet = np.asarray(feet, dtype=np.float64)
     if feet.shape[-2:] != (4, 3):

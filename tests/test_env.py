@@ -352,6 +352,15 @@ def test_the_guide_turns_to_the_goal(yaw, turns):
         assert (left + right) / 2 == pytest.approx(0.21 * max(0, math.cos(yaw)) ** 2, abs=0.05)
 
 
+def test_without_a_map_the_guide_heads_for_the_goal():
+    with closing(Guide(LocoEnv("flat", paper=loco_mtrl.OURS))) as env:
+        _, info = env.reset(seed=0)
+        x, y, _ = np.subtract(env.unwrapped.goal, env.unwrapped.position)
+        turn = math.remainder(math.atan2(y, x) - env.unwrapped.yaw, 2 * math.pi)
+        left, right = info["guide"][1:3]
+        assert np.sign(right - left) == np.sign(turn) and abs(turn) > 0.05
+
+
 def test_the_guide_walks_out_of_a_dead_end():
     """A pocket 3 m deep, its back to the goal: he has to walk away from the goal first."""
     def pocket(rng, difficulty):
