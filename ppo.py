@@ -510,9 +510,10 @@ def learn(make_env, config, *, run_dir=None, resume=False, mirror=None,
     """Train on `make_env` until config.total_timesteps; returns the ActorCritic.
 
     Args:
-        make_env: function of the environment's number, rank * num_envs + i, to a Gymnasium env
-            with Box observations and actions. What the env gets is clipped to its action space, and
-            the policy's mean lies in (-1, 1): other bounds need gymnasium.wrappers.RescaleAction.
+        make_env: function of the environment's number over all ranks, dealt out in turns, to a
+            Gymnasium env with Box observations and actions. What the env gets is clipped to its
+            action space, and the policy's mean lies in (-1, 1): other bounds need
+            gymnasium.wrappers.RescaleAction.
         run_dir: folder for config.json, progress.csv, curve.png, checkpoint.pt; None: no files.
         resume: go on from run_dir's checkpoint, with its network and its mirror.
         mirror: see ActorCritic.
@@ -570,8 +571,7 @@ def learn(make_env, config, *, run_dir=None, resume=False, mirror=None,
 
     num_steps, num_envs = config.num_steps, config.num_envs
     kept = torch.tensor(config.noise_correlation)  # share of the noise that lives on
-    first = rank * num_envs
-    envs = gym.vector.SyncVectorEnv([partial(make_env, first + i) for i in range(num_envs)])
+    envs = gym.vector.SyncVectorEnv([partial(make_env, rank + world * i) for i in range(num_envs)])
     obs_space, act_space = envs.single_observation_space, envs.single_action_space
     if not all(isinstance(space, gym.spaces.Box) for space in (obs_space, act_space)):
         raise ValueError(f"both spaces must be Box, but they are {obs_space} and {act_space}")

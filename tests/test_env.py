@@ -323,9 +323,9 @@ def test_the_guide_reaches_the_goal_of_a_world(world):
 
 
 @pytest.mark.parametrize(("arguments", "shares"), [
-    ([], [1.0] * 4 + [0.5]), (["--paper", "guide"], [0.0] * 5), (["--paper"], [0.0] * 5),
-    (["--paper", "map"], [1.0] * 4 + [0.5]),
-    (["--no-tg"], [0.0] * 5), (["--no-lidar"], [1.0] * 4 + [0.5]),
+    ([], [1.0, 0.5]), (["--paper", "guide"], [0.0, 0.0]), (["--paper"], [0.0, 0.0]),
+    (["--paper", "map"], [1.0, 0.5]),
+    (["--no-tg"], [0.0, 0.0]), (["--no-lidar"], [1.0, 0.5]),
     (["--sequential", "--tasks", "flat,walls"], [1.0, 1.0]),
 ])
 def test_who_learns_from_the_guide(arguments, shares):
