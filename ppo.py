@@ -571,6 +571,7 @@ def learn(make_env, config, *, run_dir=None, resume=False, mirror=None,
 
     num_steps, num_envs = config.num_steps, config.num_envs
     kept = torch.tensor(config.noise_correlation)  # share of the noise that lives on
+    # In turns: where neighbours are alike, as tasks are, each rank has some of all kinds.
     envs = gym.vector.SyncVectorEnv([partial(make_env, rank + world * i) for i in range(num_envs)])
     obs_space, act_space = envs.single_observation_space, envs.single_action_space
     if not all(isinstance(space, gym.spaces.Box) for space in (obs_space, act_space)):

@@ -84,13 +84,13 @@ def training(ranks):
 
     Steps/s from the second rollout on.
     """
-    steps = 30_000 * ranks
+    total = 30_000 * ranks
     with tempfile.TemporaryDirectory() as folder:
         command = [sys.executable, "-m", "loco_mtrl", "train", "--run-dir", folder]
-        command += ["--ranks", str(ranks), "--steps", str(steps)]
+        command += ["--ranks", str(ranks), "--steps", str(total)]
         subprocess.run(command, check=True, capture_output=True)
         rows = list(csv.DictReader(open(Path(folder) / "progress.csv")))
-    easy = (loco_mtrl.EASY_PART + 0.05) * steps  # its last rollout ends a little later
+    easy = (loco_mtrl.EASY_PART + 0.05) * total  # its last rollout ends a little later
     rows = [row for row in rows if float(row["steps"]) <= easy]
     collect, learn = (sum(float(row[k]) for row in rows) for k in ("collect_s", "learn_s"))
     steps = float(rows[-1]["steps"]) - float(rows[0]["steps"])
