@@ -13,6 +13,7 @@ import math
 import multiprocessing
 import operator
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -28,7 +29,7 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from ppo import PPOConfig, learn, load_checkpoint, load_policy
+from ppo import PPOConfig, learn, load_checkpoint, load_policy, write_whole
 from terrain import (
     PERSON_HEIGHT,
     PERSON_RADIUS,
@@ -211,16 +212,17 @@ class LocoEnv(gymnasium.Env):
     | entries | meaning | unit |
     |---|---|---|
     | 240 | r, LiDAR scan: sqrt(distance / 5 m), 1: no hit; rows from low to high, left to right | |
-    | 96 | chart: effort of 0.6, 1.5, 2.7, 4.5 m along each column in the robot's own map; ours | |
-    | 24 | what going each column's way would cost in all, less the cheapest: `weigh_ways`; ours | |
+    | 96 | chart: effort of 0.6, 1.5, 2.7, 4.5 m along each column in its own map; ours | * |
+    | 24 | what going each column's way costs in all, less the cheapest: `weigh_ways`; ours | * |
     | 1 | g_d, distance to the goal | m |
     | 1 | g_h, heading of the goal relative to the robot's, left positive | rad |
     | 3 | angular rates of the base in its own frame (IMU) | rad/s |
     | 12 | q, joint angles: FR, FL, RR, RL x abduction, hip, knee | rad |
     | 12 | a_{t-1}, joint targets commanded in the previous step | rad |
     | 13 | s_tg, state of the trajectory generator; none with tg=False | |
-    The paper's robot draws no map: paper=["map"] leaves chart and ways out, lidar=False all that is
-    seen. That is taken at 15 Hz, all else at 30 Hz.
+    *: log(1 + metres of open ground) / log(226), in [0, 1]. The paper's robot draws no map:
+    paper=["map"] leaves chart and ways out, lidar=False all that is seen. That is taken at 15 Hz,
+    all else at 30 Hz.
 
     ## Action: Box(-1, 1, (17,), float32), clipped to that range, then smoothed
     5 parameters of the trajectory generator (`tg.PARAMETERS`), then the 12 residuals u_fb;
@@ -241,12 +243,13 @@ class LocoEnv(gymnasium.Env):
 
     Args:
         tasks: a task's name, a function (rng, difficulty) -> heights, a finished Terrain, or a list
-            of these; None: all pillar tasks. Each episode draws one; the policy is not told which.
+            of these; None: all pillar tasks. The policy is not told which.
         difficulty: in [0, 1], or (low, high) to draw it from, once for each terrain.
         tg, lidar: the paper's ablations (section 3) leave one of them out.
         paper: which parts of OURS are left out, as in the paper; without both, no map is drawn.
         terrains: how many terrains of each task to build; Bullet never frees a mesh, so the pool
-            is built once and episodes draw from it. A finished Terrain counts once.
+            is built once. An episode takes the one that has had least time so far, and chance
+            decides between equals. A finished Terrain counts once.
         pool_seed: seeds the pool; `reset(seed=...)` seeds all else.
         render_mode: None or "rgb_array".
         gui: open PyBullet's window; it allows one in a process.
@@ -324,8 +327,8 @@ class LocoEnv(gymnasium.Env):
         if visual:
             sphere = p.createVisualShape(p.GEOM_SPHERE, radius=0.2, rgbaColor=(0.2, 0.8, 0.3, 1))
             self.flag = p.createMultiBody(0, -1, sphere)
-        self._rays = sources.tolist(), (sources + LIDAR_RANGE * directions).tolist()
         self._eyes, self._reach = sources, LIDAR_RANGE * directions
+        self._rays = sources.tolist(), (sources + self._reach).tolist()
         self._gains = dict(positionGains=[POSITION_GAIN] * 12, velocityGains=[VELOCITY_GAIN] * 12,
                            forces=[MAX_TORQUE] * 12)
         for _ in range(3):  # Bullet files what stands still elsewhere after two steps: it would
@@ -515,7 +518,12 @@ class LocoEnv(gymnasium.Env):
             self.scan[N_RAYS:] = (np.log1p(costs) / LOG_WALL).ravel()
 
     def render(self):
-        """The robot from above and behind, as uint8 (300, 400, 3)."""
+        """The robot from above and behind, as uint8 (300, 400, 3).
+
+        Raises ValueError if the environment was made without render_mode.
+        """
+        if not self.visual:
+            raise ValueError("render() needs render_mode='rgb_array'")
         p, (width, height) = self.bullet, PICTURE
         view = p.computeViewMatrixFromYawPitchRoll(self.position, 2.4, self.view_yaw, -52, 0, 2)
         projection = p.computeProjectionMatrixFOV(55, width / height, 0.1, 40)
@@ -618,8 +626,7 @@ LAYOUTS = 10  # of an environment, at most: the more it sees, the less it learns
 def training_env(index, seed, tasks, guide=False, stage=0, **options):
     """Environment number `index` over all ranks: one of the tasks, on layouts of its own.
 
-    So all tasks have the same share of every batch. An env that drew its tasks would spend its
-    time where the robot is stuck until time is up, little where it soon falls.
+    So all tasks have the same share of every batch, but for what does not divide evenly.
     """
     env = gymnasium.make("LocoMTRL-v0", disable_env_checker=True,
                          pool_seed=(seed, stage, index), tasks=tasks[index % len(tasks)],
@@ -646,7 +653,7 @@ def plan(args):
         # whatever the KL.
         rates = "learning_rate", "min_learning_rate", "max_learning_rate"
         first |= dict.fromkeys(rates, 1e-3) | dict(guide_share=1.0, target_kl=1e9, max_std=0.2)
-        last |= dict(guide_share=0.5, min_learning_rate=1e-5, learning_rate=5e-5,
+        last |= dict(guide_share=0.5, min_learning_rate=1e-5, learning_rate=1e-4,
                      max_learning_rate=1e-4)
     if args.sequential:  # one task after the other (section 3), each for as long
         n = len(args.tasks)
@@ -661,7 +668,7 @@ def train(args):
         return launch(args)
     options = {"tg": args.tg, "lidar": args.lidar, "paper": args.paper}
     meta = {**options, "tasks": args.tasks, "sequential": args.sequential,
-            "seed": args.seed, "command": "python loco_mtrl.py " + " ".join(args.argv),
+            "seed": args.seed, "command": shlex.join(["python", "loco_mtrl.py", *args.argv]),
             "commit": _commit()}
     stages = plan(args)
     with contextlib.closing(LocoEnv("flat", **options)) as env:
@@ -707,7 +714,7 @@ def train(args):
         checkpoint["model"] = {name: tensor.half() if tensor.dtype == torch.float32 else tensor
                                for name, tensor in checkpoint["model"].items()
                                if not name.startswith("critic.")}
-        torch.save(checkpoint, run_dir / "policy.pt")
+        write_whole(checkpoint, run_dir / "policy.pt")
         if args.stage is None:
             print(MADE.format(run_dir))
     return 0
@@ -748,10 +755,12 @@ def launch(args):
     command = ["--standalone", f"--nproc-per-node={args.ranks}", __file__, *args.argv, "--stage"]
     run_dir = Path(args.run_dir)
     try:
-        for k, (_, _, share, _) in enumerate(plan(args)):
+        stages = plan(args)
+        for k, (_, _, share, _) in enumerate(stages):
             if k or args.resume:  # a bad checkpoint is better named by one process
                 checkpoint = load_checkpoint(run_dir / "checkpoint.pt")
-                if checkpoint["counters"]["steps"] >= round(share * args.steps):
+                done = checkpoint["counters"]["steps"] >= round(share * args.steps)
+                if done and k + 1 < len(stages):  # the last one has policy.pt to write, too
                     continue
             torchrun.main([*command, str(k)])
     except SignalException as stop:
@@ -774,7 +783,8 @@ def launch(args):
 
 def _again(args):
     """The command that resumes this run."""
-    return " ".join(["python loco_mtrl.py", *(a for a in args.argv if a != "--resume"), "--resume"])
+    kept = [a for a in args.argv if a != "--resume"]
+    return shlex.join(["python", "loco_mtrl.py", *kept, "--resume"])
 
 
 def _commit():
@@ -835,7 +845,7 @@ def load_actor(name):
     if name in REFERENCES:
         return REFERENCES[name], {}, None
     model, checkpoint = load_policy(name)
-    meta = checkpoint["meta"]
+    meta = checkpoint["meta"] or {}
     if not {"tg", "lidar", "paper", "tasks", "sequential"} <= set(meta):
         raise ValueError(f"{name} is not a policy for LocoEnv: {meta}")
     options, tasks = {k: meta[k] for k in ("tg", "lidar", "paper")}, meta["tasks"]
@@ -897,7 +907,7 @@ def evaluate(actors, places, n_episodes, workers):
 def eval_command(args):
     """`eval`: the table of the paper for one or more policies."""
     if args.json:  # bad files are named before any work
-        Path(args.json).touch()
+        Path(args.json).open("a").close()
     rows = [load_actor(actor)[2] for actor in args.policies]
     places = args.worlds
     if args.mesh:
@@ -941,7 +951,7 @@ def draw_map(axis, terrain):
     low, high = terrain.vertices[:, :2].min(0), terrain.vertices[:, :2].max(0)
     x, y = (np.arange(a + 0.025, b, 0.05) for a, b in zip(low, high, strict=True))
     z = terrain.height(*np.meshgrid(x, y))
-    z = np.where(np.isfinite(z), z, np.nanmin(z[np.isfinite(z)]))
+    z = np.where(np.isfinite(z), z, z[np.isfinite(z)].min())
     span = dict(vmin=min(z.min(), -0.5), vmax=max(z.max(), 0.5))
     shaded = LightSource(315, 40).shade(z, colormaps["cividis"], blend_mode="soft", **span)
     axis.imshow(shaded, origin="lower", extent=(low[0], high[0], low[1], high[1]))
@@ -957,8 +967,11 @@ def play(args):
     act, options, _ = load_actor(args.policy)
     place = (args.mesh, args.scale, args.up) if args.mesh else args.world
     terrain = make_place(place, args.seed)
-    if not args.gui:
-        Path(args.gif).touch()  # a place that cannot be written is named before the work
+    if not args.gui:  # what is not installed or cannot be written is named before the work
+        from matplotlib.figure import Figure  # not pyplot: it needs no display
+        from PIL import Image
+
+        Path(args.gif).open("a").close()
     options |= {"gui": True} if args.gui else {"render_mode": "rgb_array"}
     env = gymnasium.make("LocoMTRL-v0", tasks=terrain, disable_env_checker=True,
                          max_episode_steps=round(EVAL_SECONDS / DT), **options)
@@ -979,9 +992,6 @@ def play(args):
     end = "reached the goal" if info["success"] else "fell" if info["fall"] else "ran out of time"
     print(f"{terrain.name}: t_cr {info['t_cr']:.2f}, {end} after {len(path) * DT:.1f} s")
     if not args.gui:
-        from matplotlib.figure import Figure  # not pyplot: it needs no display
-        from PIL import Image
-
         palette = Image.fromarray(np.concatenate(frames[:: len(frames) // 8 + 1])).quantize(64)
         pictures = [Image.fromarray(frame).quantize(palette=palette, dither=0) for frame in frames]
         pictures[0].save(args.gif, save_all=True, append_images=pictures[1:], loop=0,
@@ -1002,7 +1012,7 @@ def gallery(args):
     """`gallery`: every training task and every unseen world from above, in one picture."""
     from matplotlib.figure import Figure
 
-    Path(args.out).touch()  # as in play
+    Path(args.out).open("a").close()  # as in play
     figure = Figure(figsize=(15, 11), layout="constrained")
     names = [*PILLAR_TASKS, *WORLDS]
     axes = figure.subplots(-(-len(names) // 7), 7).ravel()
@@ -1025,17 +1035,21 @@ def _names(valid, what, text):
     names = text.split(",")
     for name in names:
         if name not in valid:
-            known = ", ".join(valid)
-            raise argparse.ArgumentTypeError(f"unknown {what} {name!r}; valid: {known}")
+            raise argparse.ArgumentTypeError(f"unknown {what} {name!r}; valid: {', '.join(valid)}")
     return names
 
 
 def _whole(least, text):
-    value = float(text) if text.replace(".", "").replace("e", "").isdigit() else -1.0
-    if value < least or value % 1 != 0:
-        known = f"a whole number of at least {least}"
-        raise argparse.ArgumentTypeError(f"must be {known}, got {text!r}")
-    return int(value)
+    with contextlib.suppress(ValueError, OverflowError):
+        if float(text) >= least and float(text) == int(float(text)):
+            return int(float(text))
+    raise argparse.ArgumentTypeError(f"must be a whole number of at least {least}, got {text!r}")
+
+
+def _file(suffix, text):
+    if not text.endswith(suffix):
+        raise argparse.ArgumentTypeError(f"must end in {suffix}, got {text!r}")
+    return text
 
 
 def mesh_options(p):
@@ -1088,13 +1102,15 @@ def parse(argv):
                    help="a world or a training task (default %(default)s)")
     mesh_options(p)
     p.add_argument("--seed", type=natural, default=EVAL_SEED, help="layout (default %(default)s)")
-    p.add_argument("--gif", metavar="FILE", default="play.gif", help="(default %(default)s)")
+    p.add_argument("--gif", type=partial(_file, ".gif"), metavar="FILE.gif", default="play.gif",
+                   help="(default %(default)s)")
     p.add_argument("--lidar", action="store_true", help="draw where the LiDAR's rays hit")
     p.add_argument("--gui", action="store_true", help="PyBullet's window instead of a GIF")
     p.set_defaults(run=play)
 
     p = commands.add_parser("gallery", help="draw all terrains in one picture")
-    p.add_argument("--out", metavar="FILE.png", default="gallery.png", help="(default %(default)s)")
+    p.add_argument("--out", type=partial(_file, ".png"), metavar="FILE.png", default="gallery.png",
+                   help="(default %(default)s)")
     p.add_argument("--seed", type=natural, default=0)
     p.set_defaults(run=gallery)
 
@@ -1111,7 +1127,7 @@ def main(argv=None):
         if not argv and not code:  # the main job: train, then score
             code = eval_command(parse(["eval", str(Path(args.run_dir) / "policy.pt")]))
         return code
-    except (ValueError, OSError, FloatingPointError) as error:
+    except (ValueError, OSError, ImportError, FloatingPointError) as error:
         print(f"loco_mtrl.py: error: {error}", file=sys.stderr)
         return LOST if isinstance(error, ConnectionError) else 2
 

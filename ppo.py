@@ -49,9 +49,10 @@ class PPOConfig:
     # and nothing from rewards.
     guide_share: float = 0.0
     max_grad_norm: float = 1.0  # for the actor and the critic, each on its own
-    learning_rate: float = 3e-4  # the actor's first step size; it then follows target_kl ...
-    min_learning_rate: float = 1e-4  # ... but never below this (too small: learning stops)
-    max_learning_rate: float = 1e-3  # ... nor above this
+    # The actor's step size of a run that begins; it then follows target_kl, over resumptions, too.
+    learning_rate: float = 3e-4
+    min_learning_rate: float = 1e-4  # but never falls below this (too small: learning stops)
+    max_learning_rate: float = 1e-3  # nor rises above this
     critic_learning_rate: float = 1e-3  # constant: the critic does not move the policy
     target_kl: float = 0.01  # nats by which one update should move the policy
     init_std: float | tuple[float, ...] = 0.37  # of the exploration noise; or one per action entry
@@ -71,6 +72,7 @@ class PPOConfig:
                 raise ValueError(f"{name} = {getattr(self, name)!r}, but it must be {valid}")
 
         for name, value in vars(self).items():
+            values = value if isinstance(value, tuple) else (value,)
             if name == "exteroceptive":
                 good = len(value) == 2 and all(isinstance(n, int) and n >= 0 for n in value)
                 check(name, good, "two whole numbers of at least 0, rows and columns")
@@ -78,14 +80,12 @@ class PPOConfig:
                 good = len(value) > 0 and all(isinstance(w, int) and w >= 1 for w in value)
                 check(name, good, "a non-empty tuple of whole numbers of at least 1")
             elif name in ("gamma", "gae_lambda", "noise_correlation", "guide_share"):
-                values = value if isinstance(value, tuple) else (value,)
                 check(name, values and all(0 <= v <= 1 for v in values), "in [0, 1]")
             elif isinstance(getattr(PPOConfig, name), int):
                 least = 0 if name == "seed" else 1
                 good = isinstance(value, int) and value >= least
                 check(name, good, f"a whole number of at least {least}")
             else:
-                values = value if isinstance(value, tuple) else (value,)
                 check(name, values and all(0 < v < math.inf for v in values), "above 0 and finite")
         low, high = self.min_learning_rate, self.max_learning_rate
         check("learning_rate", low <= self.learning_rate <= high, f"in [{low}, {high}]")
@@ -430,6 +430,11 @@ def save_checkpoint(path, model, config, *, optimiser=None, counters=None, meta=
                "counters": counters, "config": asdict(config),
                # Through JSON: what could not be loaded as plain data fails now, not in a month.
                "meta": json.loads(json.dumps(meta))}
+    write_whole(content, path)
+
+
+def write_whole(content, path):
+    """torch.save, but aside, and moved: whoever opens `path` finds all of it."""
     with open(f"{path}.tmp", "wb") as file:
         torch.save(content, file)
         file.flush()
@@ -654,7 +659,9 @@ def learn(make_env, config, *, run_dir=None, resume=False, mirror=None,
                 terminated[t], done[t] = torch.from_numpy(terminal), torch.from_numpy(ended)
                 returned += reward
                 for i in np.flatnonzero(ended):
-                    episode = {k: float(info[k][i]) for k in episode_keys if k in info}
+                    # Gymnasium pads what an env does not give: its masks say who does.
+                    given = [k for k in episode_keys if f"_{k}" in info and info[f"_{k}"][i]]
+                    episode = {k: float(info[k][i]) for k in given}
                     for k in episode_keys[:1] if "task" in info else ():
                         episode[f"{k}/{info['task'][i]}"] = episode.get(k, math.nan)
                     episodes.append({"return": returned[i], **episode})

@@ -23,7 +23,7 @@ CELL = 0.1  # m, navigation grid; a disc of 0.25 m radius is known on it to half
 CLIMB = 0.12  # m, highest step that Laikago's feet clear with room to spare
 STEP = 0.2  # m, highest step that they clear at all: what training may ask for
 FLAT = 0.05  # m, most that the ground under a start may vary
-PAD = 9  # pillars, depth of the flat strip at both ends where episodes start (1.8 m)
+PAD = 9  # pillars, depth of the flat strips where most episodes start, at both ends (1.8 m)
 ROUTES = 8  # start and goal pairs per training terrain
 TRIES = 20  # redraws before a generator is said to yield no route
 
@@ -469,9 +469,9 @@ def _noise(rng, shape, coarse):
     for_axis = []
     for n, c in zip(shape, coarse, strict=True):
         at = np.linspace(0, c - 1, n)
-        part = at - np.floor(np.minimum(at, c - 2))
-        ease = part * part * (3 - 2 * part)
         low = np.minimum(at.astype(int), c - 2)
+        part = at - low
+        ease = part * part * (3 - 2 * part)
         weight = np.zeros((n, c))
         weight[np.arange(n), low], weight[np.arange(n), low + 1] = 1 - ease, ease
         for_axis.append(weight)
@@ -553,7 +553,7 @@ hills.cell = L / 2  # m: steps so low that slopes feel, and look to the LiDAR, n
 
 
 def pyramids_up(rng, difficulty):
-    """Stepped pyramids of 3 to 6 steps of up to 0.18 m, treads of 0.4 m."""
+    """Stepped pyramids of 2 to 5 steps of up to 0.18 m, treads of 0.4 m."""
     level = np.zeros(SHAPE)
     for x, y in zip(rng.uniform(3, 9, 7), rng.uniform(-4, 4, 7), strict=True):
         ring = np.maximum(np.abs(X - x), np.abs(Y - y)) / 0.4
@@ -788,11 +788,11 @@ def triangulate(heights, cell):
     vertices = np.stack([i * cell[0], (j - (n - 1) / 2) * cell[1], heights], -1).reshape(-1, 3)
     a = (i * n + j)[:-1, :-1].ravel()  # each square's corner at the least x and y
     lower, upper = np.stack([a, a + n, a + n + 1], 1), np.stack([a, a + n + 1, a + 1], 1)
-    return vertices, np.concatenate([lower, upper])
+    return vertices, np.concatenate([lower, upper]).astype(np.int32)
 
 
 def _prisms(x, y, radius, bottom, top, sides):
-    """Mesh of upright prisms at x, y (P,) with `sides` walls and a lid: trunks, posts, boxes."""
+    """Mesh of upright prisms at x, y (P,) with `sides` walls and a lid: rocks, trunks."""
     turn = 2 * np.pi * (np.arange(sides) + 0.5) / sides
     parts = []
     for cx, cy, r, z0, z1 in zip(*np.broadcast_arrays(x, y, radius, bottom, top), strict=True):
@@ -902,16 +902,14 @@ def mountain(rng):
     i, j = (np.indices(plan.shape) + 0.5) * FINE
     foot = Ground(nodes, (cell, cell), smooth=True)(x, y)
     for k in range(40):
-        rock = np.hypot(i - x[k], j - 5.0 - y[k]) <= radius[k]
-        plan[rock] = foot[k] + tall[k]
+        plan[np.hypot(i - x[k], j - 5.0 - y[k]) <= radius[k]] = foot[k] + tall[k]
     rocks = _prisms(x, y, radius, foot - 0.5, foot + tall, 7)
     return _world("mountain", rng, plan, _join([triangulate(nodes, (cell, cell)), rocks]), CLIMB)
 
 
 def forest(rng):
     """Ground with bumps of 0.1 m and a trunk, 0.16-0.4 m thick, on every 3 m2: 12 x 10 m."""
-    size, cell, count = (12.0, 10.0), 0.25, 40
-    shape = tuple(round(s / cell) + 1 for s in size)
+    cell, count, shape = 0.25, 40, (49, 41)
     nodes = 0.05 * _noise(rng, shape, (9, 8)) + rng.uniform(-0.04, 0.04, shape)
     plan = _plan_of(nodes, cell, (120, 100))
     x, y = rng.uniform(0.3, 11.7, count), rng.uniform(-4.7, 4.7, count)
@@ -1069,7 +1067,8 @@ WORLDS = {world.__name__: world for world in (
 def make_world(name, seed):
     """One of the eight unseen worlds (paper section 3): another layout and route for each seed.
 
-    Raises ValueError for an unknown name or a seed that is not a whole number of at least 0.
+    Raises ValueError for an unknown name, a seed that is not a whole number of at least 0, and if
+    there is no walkable route in TRIES draws.
     """
     if name not in WORLDS:
         raise ValueError(f"unknown world {name!r}; valid worlds: {', '.join(WORLDS)}")
@@ -1102,7 +1101,7 @@ def _read_obj(path):
                     vertices.append((x, y, z))
                 elif kind == "f":
                     corners = [int(word.split("/")[0]) for word in words]
-                    corners = [c - 1 if c > 0 else len(vertices) + c for c in corners]
+                    corners = [c - 1 if c >= 0 else len(vertices) + c for c in corners]
                     triangles += [(corners[0], *pair) for pair in pairwise(corners[1:])]
             except ValueError:
                 bad = f"{path} is not a mesh: line {number} reads {line[:40]!r}"

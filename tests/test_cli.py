@@ -90,11 +90,15 @@ def test_ctrl_c_saves_and_a_killed_rank_stops_all(tmp_path):
 
 
 def test_resume_goes_on(trained):
-    result = run("train", "--tasks", "flat", "--steps", 9000, "--ranks", 2, "--run-dir", trained,
-                 "--resume", cwd=trained)  # fmt: skip
+    command = ["train", "--tasks", "flat", "--steps", 9000, "--ranks", 2, "--run-dir", trained]
+    result = run(*command, "--resume", cwd=trained)
     assert result.returncode == 0, result.stderr
     steps = [int(row["steps"]) for row in progress(trained)]
     assert steps == sorted(set(steps)) and 5000 < steps[-1] < 9000 + 2 * 12 * 160
+    # Ctrl-C in the very last update leaves a whole checkpoint, but no policy yet.
+    (trained / "policy.pt").unlink()
+    result = run(*command, "--resume", cwd=trained)
+    assert result.returncode == 0 and (trained / "policy.pt").is_file(), result.stderr
 
 
 def test_eval_prints_the_same_table_twice_and_writes_json(trained):
@@ -177,7 +181,12 @@ def test_play_writes_a_gif_that_moves_and_a_map(trained):
         (["play", "zero", "--gif", "/proc/nowhere/walk.gif"], "/proc/nowhere"),
         (["play", "zero", "--seed", "-3"], "-3"),
         (["gallery", "--out", "/proc/nowhere/all.png"], "/proc/nowhere"),
+        (["play", "zero", "--gif", "walk.png"], "walk.png"),
+        (["gallery", "--out", "all.gif"], "all.gif"),
         (["gallery", "--seed", "0.5"], "0.5"),
+        (["eval", "zero", "--json", "."], "directory"),
+        (["train", "--steps", "1.2.3"], "whole number"),
+        (["train", "--steps", "inf"], "whole number"),
     ],
 )
 def test_wrong_calls_end_with_one_clear_line(arguments, named, capsys):
@@ -200,7 +209,8 @@ def test_wrong_checkpoints_are_named(trained, tmp_path, capsys):
     model = ppo.ActorCritic(obs_dim=7, act_dim=2)
     meta = {"tg": True, "lidar": True, "paper": [], "tasks": ["flat"], "sequential": False}
     ppo.save_checkpoint(tmp_path / "sizes.pt", model, ppo.PPOConfig(), meta=meta)
-    for name in ("cut", "text", "code", "other", "sizes"):
+    ppo.save_checkpoint(tmp_path / "silent.pt", model, ppo.PPOConfig())
+    for name in ("cut", "text", "code", "other", "sizes", "silent"):
         assert loco_mtrl.main(["eval", str(tmp_path / f"{name}.pt")]) == 2
         error = capsys.readouterr().err
         assert f"{name}.pt" in error and error.count("\n") == 1

@@ -196,6 +196,11 @@ def test_a_blind_robot_has_no_rays_to_draw():
         assert env.render().shape == (300, 400, 3)
 
 
+def test_without_pictures_there_is_nothing_to_render(flat):
+    with pytest.raises(ValueError, match="render_mode"):
+        flat.render()
+
+
 def test_lidar_never_sees_the_robot(flat):
     """The scan stays that of the plane with a leg stretched out right before the sensor."""
     flat.reset(seed=0)
@@ -222,11 +227,12 @@ def test_lidar_still_sees_a_thin_wall_that_it_touches(side):
     with closing(LocoEnv(terrain.Terrain("thin", *mesh, start, goal, ground))) as env:
         env.reset(seed=0)
         place(env, 5.025 - 0.6 * side, 0.0, 0.3)
-        touched = 0
+        touched, action = 0, np.zeros(17)
+        action[4] = 1.0  # on long legs: the knees of bent ones would be first at the wall
         for _ in range(40):  # pushed against it, head or tail on
             push = (400.0 * side, 0, 0), (0, 0, 0), env.bullet.LINK_FRAME
             env.bullet.applyExternalForce(env.robot, -1, *push)
-            seen = metres(env.step(np.zeros(17))[0]).reshape(loco_mtrl.LIDAR_AZIMUTHS.shape)
+            seen = metres(env.step(action)[0]).reshape(loco_mtrl.LIDAR_AZIMUTHS.shape)
             if env.steps % loco_mtrl.LIDAR_EVERY == 0:
                 base = env.bullet.getContactPoints(env.robot, linkIndexA=-1)
                 if any(abs(contact[7][0]) > 0.9 for contact in base):

@@ -395,6 +395,7 @@ def test_bad_meshes_are_named(tmp_path):
     assert "line 5" in error(square + "f a b c\n")
     assert "not finite" in error("v nan 0 0\n" + square + "f 1 2 3\n")
     assert "not there" in error(square + "f 1 2 9\n")
+    assert "not there" in error("v 0 0 0\nf 0 1 2\n" + square)
     assert "no floor" in error("v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\nf 1 2 3\n")
     assert "too large" in error("v 0 0 0\n" * 131_073 + "f 1 2 3\n")
     assert "too large" in error(square + "f 1 2 3\n" * 174_763)

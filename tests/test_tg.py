@@ -56,7 +56,7 @@ def test_a_pose_by_hand():
 def test_standing_feet_are_spread_about_their_hips():
     feet = tg.foot_position(tg.STANDING)
     np.testing.assert_allclose(feet[:, 0], [0.11, 0.11, -0.05, -0.05])
-    np.testing.assert_allclose(feet[:, 1], tg.LATERAL + tg.SIDE * 0.12)
+    np.testing.assert_allclose(feet[:, 1], tg.LATERAL + tg.SIDE * 0.09)
     np.testing.assert_allclose(feet[:, 2], -0.25)
 
 
@@ -107,8 +107,8 @@ def test_stance_slides_back_and_swing_lifts():
     np.testing.assert_allclose(feet[:, 2], -0.25)
     generator.reset(2 * np.pi * 0.75)  # FR is half through its swing, FL half through its stance
     feet = generator.feet()
-    assert feet[0] == pytest.approx([0.11, tg.LATERAL[0] - 0.12, -0.25 + 0.26])
-    assert feet[1] == pytest.approx([0.11, tg.LATERAL[1] + 0.12, -0.25])
+    assert feet[0] == pytest.approx([0.11, tg.LATERAL[0] - 0.09, -0.25 + 0.26])
+    assert feet[1] == pytest.approx([0.11, tg.LATERAL[1] + 0.09, -0.25])
     generator.reset(2 * np.pi * 0.1)  # a fifth of the stance of FR is over
     assert generator.feet()[0, 0] == pytest.approx(0.11 + 0.065 - 0.13 / 5)
 
