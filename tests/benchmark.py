@@ -9,6 +9,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import gymnasium
@@ -98,6 +99,12 @@ def training(ranks):
     return steps / minutes / 60, learn / (collect + learn)
 
 
+def apart():
+    """Steps/s of two trainings of one rank each at once, together: as much as the machine gives."""
+    with ThreadPoolExecutor(2) as pool:
+        return sum(rate for rate, _ in pool.map(training, (1, 1)))
+
+
 def precautions(rate):
     """Share of a training's time, at `rate` steps/s, for checkpoints, curves and checks for NaN."""
     spent, steps = {}, 30_000
@@ -144,12 +151,13 @@ def main():
     rows.append(("memory of one rank, all tasks", f"{size:.0f} MB"))
     rows.append(("  growth over resets 500 to 5,000", f"{growth:.1f} MB"))
     # In turns, since a machine's own speed may change by a third within minutes.
-    runs = np.array([[*training(1), *training(2)] for _ in range(2)])
-    one, _, two, share = np.median(runs, axis=0)
-    ratios = " ".join(f"{two / one:.2f}" for one, _, two, _ in runs)
+    runs = np.array([[*training(1), *training(2), apart()] for _ in range(3)])
+    one, _, two, share, _ = np.median(runs, axis=0)
+    ratios, limits = (" ".join(f"{run[k] / run[0]:.2f}" for run in runs) for k in (2, 4))
     rows.append(("training steps/s, 1 rank", f"{one:.0f}"))
     rows.append(("training steps/s, 2 ranks", f"{two:.0f}"))
-    rows.append(("  times those of 1 rank, two pairs", ratios))
+    rows.append(("  times those of 1 rank, three times", ratios))
+    rows.append(("  two separate trainings, likewise", limits))
     rows.append(("training steps/s, 4 ranks", f"{training(4)[0]:.0f}"))
     rows.append(("  share of learning, 2 ranks", f"{share:.2f}"))
     rows.append(("share of checkpoints, curves, checks for NaN", f"{precautions(one):.2%}"))
