@@ -1041,8 +1041,9 @@ def _names(valid, what, text):
 
 def _whole(least, text):
     with contextlib.suppress(ValueError, OverflowError):
-        if float(text) >= least and float(text) == int(float(text)):
-            return int(float(text))
+        value = int(float(text))
+        if value == float(text) >= least:
+            return value
     raise argparse.ArgumentTypeError(f"must be a whole number of at least {least}, got {text!r}")
 
 

@@ -80,7 +80,7 @@ PARAMETERS = {
 CENTRE, RANGE = np.array(list(PARAMETERS.values())).T
 PHASE_OFFSET = (0.0, math.pi, math.pi, 0.0)  # trot: diagonal legs move together
 DUTY = 0.5  # share of a stride that a foot stands: two feet are down at any time
-OUTWARD = 0.09  # m that feet stand outside their leg plane: less tips over, more climbs badly
+OUTWARD = 0.09  # m that feet stand outside their leg plane: 0.06 falls more, 0.12 climbs less
 FORWARD = (0.11, 0.11, -0.05, -0.05)  # m that they stand ahead of their hips: a long one, slopes
 _STANDING_FEET = np.stack([FORWARD, LATERAL + SIDE * OUTWARD, [-CENTRE[4]] * 4], 1)
 STANDING = joint_angles(_STANDING_FEET)  # (12,) rad, the pose of a gait without strides
@@ -122,14 +122,19 @@ class TrajectoryGenerator:
             raise ValueError(f"action must be {CENTRE.size} finite numbers, got {action}")
         if not 0 <= dt < math.inf:
             raise ValueError(f"dt must be at least 0 and finite, got {dt}")
+        # Lists from here on: NumPy is slow on so few numbers.
         self.scaled = [min(max(value, -1.0), 1.0) for value in action.tolist()]
         pairs = zip(PARAMETERS.values(), self.scaled, strict=True)
         self.parameters = [centre + half * scaled for (centre, half), scaled in pairs]
         self.phase = (self.phase + 2 * math.pi * self.parameters[0] * dt) % (2 * math.pi)
-        return joint_angles(self.feet())
+        legs = enumerate(self._feet())
+        return np.array([angle for k, foot in legs for angle in _leg_angles(k, *foot)])
 
     def feet(self):
         """Foot targets (4, 3) in the hip frames at the present phase and parameters, m."""
+        return np.array(self._feet())
+
+    def _feet(self):
         _, left, right, lift, height = self.parameters
         feet = []
         for offset, stride, forward, lateral, side in zip(
@@ -142,7 +147,7 @@ class TrajectoryGenerator:
                 swing = (cycle - DUTY) / (1 - DUTY)
                 x, z = stride * (swing - 0.5), lift * math.sin(math.pi * swing) - height
             feet.append((forward + x, lateral + side * OUTWARD, z))
-        return np.array(feet)
+        return feet
 
     def state(self):
         """s_tg, a list of 13: cosine and sine of each leg's phase, then `scaled`."""
