@@ -1,4 +1,4 @@
-"""How fast the project is, as a table: `python tests/benchmark.py`, about 10 minutes.
+"""How fast the project is, as a table: `python tests/benchmark.py`, 10 to 15 minutes.
 
 Asserts nothing, for times depend on the machine: run it on an idle one and compare the ratios.
 """
@@ -132,37 +132,38 @@ def memory():
     return sizes[500], sizes[5000] - sizes[500]
 
 
+def show(name, value):
+    print(f"{name:55}{value:>15}", flush=True)  # at once: whoever stops it keeps what is measured
+
+
 def main():
-    rows = []
     for label, paper in (("as the paper's", loco_mtrl.OURS), ("with the map", ())):
         spent, env = {}, LocoEnv("rugged", difficulty=0.5, paper=paper)
         step, reset = walk(env, STEPS)
         measured, _ = walk(env, STEPS, spent)
         env.close()
         inside = sum(map(sum, spent.values())) / STEPS
-        rows.append((f"steps/s on one core, rugged pillars, {label}", f"{1 / step:.0f}"))
+        show(f"steps/s on one core, rugged pillars, {label}", f"{1 / step:.0f}")
         for name, seconds in spent.items():
-            rows.append((f"  ms a step in {name}", f"{sum(seconds) / STEPS * 1e3:.3f}"))
-        rows.append(("  share inside those two", f"{inside / measured:.2f}"))
+            show(f"  ms a step in {name}", f"{sum(seconds) / STEPS * 1e3:.3f}")
+        show("  share inside those two", f"{inside / measured:.2f}")
     naive, _ = walk(NaiveEnv("rugged", difficulty=0.5), 200)
-    rows.append(("one box per pillar and the URDF's meshes: slower by", f"{naive / step:.0f}x"))
-    rows.append(("reset", f"{reset * 1e3:.1f} ms"))
+    show("one box per pillar and the URDF's meshes: slower by", f"{naive / step:.0f}x")
+    show("reset", f"{reset * 1e3:.1f} ms")
     size, growth = memory()
-    rows.append(("memory of one rank, all tasks", f"{size:.0f} MB"))
-    rows.append(("  growth over resets 500 to 5,000", f"{growth:.1f} MB"))
+    show("memory of one rank, all tasks", f"{size:.0f} MB")
+    show("  growth over resets 500 to 5,000", f"{growth:.1f} MB")
     # In turns, since a machine's own speed may change by a third within minutes.
     runs = np.array([[*training(1), *training(2), apart()] for _ in range(3)])
     one, _, two, share, _ = np.median(runs, axis=0)
     ratios, limits = (" ".join(f"{run[k] / run[0]:.2f}" for run in runs) for k in (2, 4))
-    rows.append(("training steps/s, 1 rank", f"{one:.0f}"))
-    rows.append(("training steps/s, 2 ranks", f"{two:.0f}"))
-    rows.append(("  times those of 1 rank, three times", ratios))
-    rows.append(("  two separate trainings, likewise", limits))
-    rows.append(("training steps/s, 4 ranks", f"{training(4)[0]:.0f}"))
-    rows.append(("  share of learning, 2 ranks", f"{share:.2f}"))
-    rows.append(("share of checkpoints, curves, checks for NaN", f"{precautions(one):.2%}"))
-    for name, value in rows:
-        print(f"{name:55}{value:>15}")
+    show("training steps/s, 1 rank", f"{one:.0f}")
+    show("training steps/s, 2 ranks", f"{two:.0f}")
+    show("  times those of 1 rank, three times", ratios)
+    show("  two separate trainings, likewise", limits)
+    show("training steps/s, 4 ranks", f"{training(4)[0]:.0f}")
+    show("  share of learning, 2 ranks", f"{share:.2f}")
+    show("share of checkpoints, curves, checks for NaN", f"{precautions(one):.2%}")
 
 
 if __name__ == "__main__":
