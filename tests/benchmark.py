@@ -153,16 +153,13 @@ def main():
     size, growth = memory()
     show("memory of one rank, all tasks", f"{size:.0f} MB")
     show("  growth over resets 500 to 5,000", f"{growth:.1f} MB")
-    # In turns, since a machine's own speed may change by a third within minutes.
-    runs = np.array([[*training(1), *training(2), apart()] for _ in range(3)])
-    one, _, two, share, _ = np.median(runs, axis=0)
-    ratios, limits = (" ".join(f"{run[k] / run[0]:.2f}" for run in runs) for k in (2, 4))
-    show("training steps/s, 1 rank", f"{one:.0f}")
-    show("training steps/s, 2 ranks", f"{two:.0f}")
-    show("  times those of 1 rank, three times", ratios)
-    show("  two separate trainings, likewise", limits)
+    for _ in range(3):  # in turns, since a machine's own speed may change by a third within minutes
+        (one, _), (two, share), both = training(1), training(2), apart()
+        rates = f"{one:.0f} {two:.0f} {both:.0f}"
+        show("training steps/s: 1 rank, 2 ranks, two separate ones", rates)
+        show("  times those of 1 rank", f"{two / one:.2f} {both / one:.2f}")
+        show("  share of learning, 2 ranks", f"{share:.2f}")
     show("training steps/s, 4 ranks", f"{training(4)[0]:.0f}")
-    show("  share of learning, 2 ranks", f"{share:.2f}")
     show("share of checkpoints, curves, checks for NaN", f"{precautions(one):.2%}")
 
 
