@@ -6,6 +6,7 @@ Diverse Environments"; the sections named below are the paper's.
 """
 
 import argparse
+import cmath
 import contextlib
 import json
 import logging
@@ -154,6 +155,7 @@ def lidar_rays():
 CHART_RADII, CHART_EVERY = (0.6, 1.5, 2.7, 4.5), 10
 _LINES = np.radians(LIDAR_AZIMUTHS[0])
 _PACES = np.arange(0.3, 4.6, 0.3)  # m, the places on a line
+_PLACES, _TURN = _PACES[:, None] * np.exp(1j * _LINES), 0.3 * np.abs(_LINES) / np.pi
 _CHARTED = np.isin(np.round(_PACES, 1), CHART_RADII)
 LOG_WALL = math.log1p(225)  # all the way in a wall: what is observed are logarithms, in [0, 1]
 
@@ -165,11 +167,11 @@ def weigh_ways(chart, x, y, yaw):
     the least that going by each column costs in all (24,): the effort to some place on it, from
     0.6 m on, what is left from there to the goal, and up to 0.3 m for the turn.
     """
-    angles, paces = yaw + _LINES, _PACES[:, None]
-    px, py = x + paces * np.cos(angles), y + paces * np.sin(angles)
-    way = 0.3 * chart.effort(px, py).cumsum(0)
-    whole = (way + chart.to_go(px, py))[1:].min(0)  # nearer, all columns would look alike
-    return way, whole + 0.3 * np.abs(_LINES) / np.pi
+    places = complex(x, y) + cmath.rect(1.0, yaw) * _PLACES
+    x, y = places.real, places.imag
+    way = 0.3 * chart.effort(x, y).cumsum(0)
+    whole = (way + chart.to_go(x, y))[1:].min(0)  # nearer, all columns would look alike
+    return way, whole + _TURN
 
 
 # ------------------------------------------------------------------------------- the environment
@@ -408,7 +410,7 @@ class LocoEnv(gymnasium.Env):
         for joint, angle in zip(self.joints, self.target, strict=True):
             p.resetJointState(self.robot, joint, angle)
         self.time, self.steps, self.collisions = 0.0, 0, 0
-        self.chart = Chart(*position[:2], self.goal)
+        self.chart, self.scans = Chart(*position[:2], self.goal), []  # seen, not on the chart yet
         self.touching = self.exploded = False
         self.walked = np.zeros(len(self.people))  # seconds that each of them has been walking
         for body in self.people:  # not all terrains have as many
@@ -506,16 +508,20 @@ class LocoEnv(gymnasium.Env):
         if not self.charting:
             return
         if self.lidar:
-            turn = np.reshape(r, (3, 3)).T
-            eyes = self._eyes @ turn + self.position
-            hits = eyes + fractions[:, None] * (self._reach @ turn)
-            self.chart.see(eyes, hits, fractions < 1, z - BASE_HEIGHT)
+            self.scans.append((fractions, r, self.position))
             if self.steps % CHART_EVERY == 0:
+                fractions, turns, places = map(np.array, zip(*self.scans, strict=True))
+                turns = turns.reshape(-1, 3, 3).transpose(0, 2, 1)
+                eyes = self._eyes @ turns + places[:, None]
+                hits = eyes + fractions[..., None] * (self._reach @ turns)
+                self.chart.see(eyes.reshape(-1, 3), hits.reshape(-1, 3), fractions.ravel() < 1,
+                               z - BASE_HEIGHT)
                 self.chart.draw(x, y, z - BASE_HEIGHT)
+                self.scans.clear()
         way, self.whole = weigh_ways(self.chart, x, y, self.yaw)
         if self.charted:
-            costs = np.vstack([way[_CHARTED], self.whole - self.whole.min()])
-            self.scan[N_RAYS:] = (np.log1p(costs) / LOG_WALL).ravel()
+            costs = np.append(way[_CHARTED], self.whole - self.whole.min())
+            self.scan[N_RAYS:] = np.log1p(costs) / LOG_WALL
 
     def render(self):
         """The robot from above and behind, as uint8 (300, 400, 3).

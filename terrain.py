@@ -9,12 +9,10 @@ lengths are in metres and all angles in radians unless a name says otherwise.
 """
 
 from dataclasses import dataclass
-from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 
 L = W = 0.2  # m, cross-section of a training pillar
 SHAPE = (60, 40)  # m x n pillars: 12 m x 8 m
@@ -35,7 +33,8 @@ STEEP, BRINK = 0.65, 0.08  # rays of a slope above STEEP have passed it BRINK m 
 HIDDEN = 4  # squares, at most, from the last ground that is seen to where a ray shows its edge
 GRAZE = 0.05  # m below a height that a ray must pass to have passed through it
 SPARED = 0.3  # m before a wall where rays pass through nothing: met at a slant, they graze it
-FADE = 0.8  # of a height is left when a ray passes through it
+LONG = 1.0  # m, rays that reach as far show what has gone; others end on the ground
+FADE = 0.33  # of a height is left when a ray passes through it
 
 PERSON_RADIUS, PERSON_HEIGHT = 0.25, 1.7  # m, the body that an environment gives a Person
 
@@ -204,11 +203,11 @@ def fuse_pillars(heights, l, w):  # noqa: E741 - the paper's own names
 def _window(a, radius, pick):
     """`pick` (np.maximum or np.minimum) over the square of +-`radius` cells around each cell."""
     for _ in range(2):
-        n = len(a)
-        padded = a[np.arange(-radius, n + radius).clip(0, n - 1)]
-        a = padded[:n]
-        for shift in range(1, 2 * radius + 1):
-            a = pick(a, padded[shift : shift + n])
+        a = a.take(np.arange(-radius, len(a) + radius), 0, mode="clip")  # the rim goes on
+        width = 1  # cells that each entry stands for; doubled, and at last made 2 * radius + 1
+        while width <= 2 * radius:
+            more = min(width, 2 * radius + 1 - width)
+            a, width = pick(a[:-more], a[more:]), width + more
         a = a.T
     return a
 
@@ -293,19 +292,16 @@ def _cost(z, free):
     Where z is NaN nothing is known of slopes, nor paid for them.
     """
     near, rings = ~free, round(0.4 / CHART)
-    inside = np.zeros(free.shape, np.float32)  # how many of the rings around what is not free
-    for _ in range(rings):
+    inside = near.astype(np.float32)  # in how many of the rings around what is not free
+    for _ in range(rings - 1):
+        near = _window(near, 1, np.logical_or)
         inside += near
-        near = _window(near, 1, np.maximum)
-    slope = np.minimum(np.hypot(*np.gradient(z, CHART)), 1)
-    cost = 1 + 8 * (inside / rings) ** 2 + 10 * np.fmax(slope - 0.2, 0)
-    return np.where(free, cost, 50).astype(np.float32)
-
-
-# m, half the length of a step to each of the squares around: each of the two squares that it joins
-# is paid for its half. To stay is no step.
-_LENGTHS = CHART * np.hypot(*np.indices((3, 3)) - 1)[..., None, None].astype(np.float32)
-_LENGTHS[1, 1] = np.inf
+    cost = 1 + 8 * (inside / rings) ** 2
+    x, y = z[2:, 1:-1] - z[:-2, 1:-1], z[1:-1, 2:] - z[1:-1, :-2]
+    slope = np.minimum(np.sqrt(x * x + y * y) / (2 * CHART), 1)
+    cost[1:-1, 1:-1] += 10 * np.fmax(slope - 0.2, 0)
+    cost[~free] = 50
+    return cost
 
 
 class Chart:
@@ -324,68 +320,71 @@ class Chart:
     rounds = 12  # of value iteration, each time that the map is drawn
 
     def __init__(self, x, y, goal):
-        self.corner = np.floor(np.array([x, y]) / CHART).astype(int) - self.size // 2
+        self.corner = np.floor(np.array([x, y]) / CHART) - self.size // 2
         self.low, self.high, self.below = np.full((3, self.size**2), np.nan, np.float32)
         self.cost = np.ones((self.size, self.size), np.float32)
         at = (2 * np.arange(self.size // 2)[:, None] + self.corner + 1) * CHART
         self.left = np.hypot(at[:, :1] - goal[0], at[:, 1] - goal[1]).astype(np.float32)
-        self.goal = tuple(k // 2 for k in self._squares(*goal[:2]))
+        self.goal = tuple(self._squares(*goal[:2]).astype(int) // 2)
         self.least = self.left[self.goal]  # nearly 0, but for a goal beyond the map
 
     def _squares(self, x, y):
-        i, j = (np.floor(c / CHART).astype(int) - low
-                for c, low in zip((x, y), self.corner, strict=True))
-        return i.clip(0, self.size - 1), j.clip(0, self.size - 1)
+        """x, y (m, arrays) in squares from the corner, (2, ...); what is off the map at its rim."""
+        squares = np.array((x, y)).T / CHART - self.corner
+        return np.minimum(np.maximum(squares, 1.0), self.size - 2.01).T
 
     def _at(self, x, y):
-        i, j = self._squares(x, y)
+        """Indices of the squares at x, y into a flat map."""
+        i, j = self._squares(x, y).astype(int)
         return i * self.size + j
 
     def see(self, eyes, hits, hit, ground):
-        """Enters a scan: rays from `eyes` to `hits` (R, 3) m, where they end by a `hit` (R,) or in
+        """Enters scans: rays from `eyes` to `hits` (R, 3) m, where they end by a `hit` (R,) or in
         the air; `ground`: m, the height on which the robot stands.
         """
-        self._clear(eyes, hits, ground)
+        way = hits - eyes
+        self._clear(eyes, way, SPARED * (hits[:, 2] > ground + 0.1))
         # A little further: what is hit lies behind its surface, in the square there.
-        ends = hits[hit] + 0.002 * (hits - eyes)[hit]
-        at, z = self._at(*ends[:, :2].T), ends[:, 2].astype(np.float32)
+        x, y, z = (hits[hit] + 0.002 * way[hit]).T
+        at, z = self._at(x, y), z.astype(np.float32)
         np.fmin.at(self.low, at, z)
         np.fmax.at(self.high, at, z)
         # Where a ray passes a step below, the ground can be no higher. A steep one needs less of a
         # margin, for no slope to walk on falls so: it has passed an edge.
         over = hits[:, 2] < ground - DROP
-        a, way = eyes[over], (hits - eyes)[over]
-        steep = -way[:, 2] > STEEP * np.hypot(way[:, 0], way[:, 1])
+        a, way = eyes[over].T, way[over].T
+        steep = -way[2] > STEEP * np.hypot(way[0], way[1])
         level = ground - np.where(steep, BRINK, DROP)
-        part = (level - a[:, 2]) / way[:, 2]
-        x, y = (a + part[:, None] * way)[:, :2].T
+        x, y, _ = a + (level - a[2]) / way[2] * way
         level = np.where(steep, hits[over, 2], level).astype(np.float32)
         np.fmin.at(self.below, self._at(x, y), level)
 
-    def _clear(self, eyes, hits, ground):
-        """Lowers what rays have passed through: people move on. See `see`."""
-        way = hits - eyes
+    def _clear(self, eyes, way, spared):
+        """Lowers what long rays pass through, up to `spared` m before their ends: people move on.
+        """
         length = np.hypot(way[:, 0], way[:, 1])
-        wall = hits[:, 2] > ground + 0.1
-        end = length - np.where(wall, SPARED, 0)
-        paces = np.arange(0.3, end.max(), CHART)  # not from the lens on: the robot stands there
-        ray, pace = np.nonzero(paces < end[:, None])
-        part = paces[pace] / length[ray]
-        x, y, z = (a[ray] + part * b[ray] for a, b in zip(eyes.T, way.T, strict=True))
-        through, z = self._at(x, y), z.astype(np.float32)
-        gone = self.high[through] > z + GRAZE
-        at, z = through[gone], z[gone]
-        self.low[at] += (1 - FADE) * np.minimum(z - self.low[at], 0)
-        self.high[at] = self.low[at] + FADE * (self.high[at] - self.low[at])
+        far = length > LONG
+        length, end = length[far, None], (length - spared)[far, None]
+        # In squares, and from 0.3 m on: nearer, the robot stands. Off the map x and y mean squares
+        # at its other end, too far away to matter.
+        unit, corner = np.array([1 / CHART, 1 / CHART, 1]), np.append(self.corner, 0)
+        eye, pace = np.float32([eyes[far] * unit - corner, way[far] / length * unit])
+        paces = np.arange(0.3, end.max(initial=0.3), CHART, dtype=np.float32)
+        x, y, z = eye.T[..., None] + pace.T[..., None] * paces
+        at = x.astype(np.int32) * self.size + y.astype(np.int32)
+        gone = (self.high.take(at, mode="clip") > z + GRAZE) & (paces < end)
+        at, z = at[gone].clip(0, self.high.size - 1), z[gone]
+        low = self.low[at]
+        self.low[at] = low = low + (1 - FADE) * np.minimum(z - low, 0)
+        self.high[at] = low + FADE * (self.high[at] - low)
 
     def draw(self, x, y, ground):
         """Works out anew what a metre costs, and what is left from where, up to 4.8 m around x, y.
 
         `ground` as in `see`.
         """
-        i, j = (2 * (int(c) // 2) for c in self._squares(x, y))  # of a larger square's corner
-        here = (slice(max(i - self.half, 0), i + self.half),
-                slice(max(j - self.half, 0), j + self.half))
+        corner = 2 * (self._squares(x, y).astype(int) // 2)  # of a larger square
+        here = tuple(slice(max(k - self.half, 0), k + self.half) for k in corner.tolist())
         low, high, below = (a.reshape(self.cost.shape)[here]
                             for a in (self.low, self.high, self.below))
         z = (low + high) / 2  # NaN: not seen yet
@@ -399,30 +398,36 @@ class Chart:
         edge |= _window(gone, 1, np.maximum)  # the brink is nearer than where it shows
         self.cost[here] = cost = _cost(z, ~_window(edge, BODY, np.maximum))
 
-        # Value iteration: what is left from a square is a step and what is left from where it ends.
+        # Value iteration: what is left from a square is a step to one of the 8 around, each of the
+        # two paid for its half of it, and what is left from there.
         cost = np.minimum(cost[::2], cost[1::2])
-        cost = np.minimum(cost[:, ::2], cost[:, 1::2])
+        straight = CHART * np.minimum(cost[:, ::2], cost[:, 1::2])
+        diagonal = 2**0.5 * straight
         left = self.left[tuple(slice(k.start // 2, k.stop // 2) for k in here)]  # a view
         inner = np.s_[1:-1, 1:-1]
-        around = partial(sliding_window_view, window_shape=left[inner].shape)  # (3, 3, ...): views
-        steps, there = _LENGTHS * (around(cost) + cost[inner]), around(left)
         for _ in range(self.rounds):
-            # Else the sum keeps the views' order, along which the minimum takes twice as long.
-            left[inner] = np.add(there, steps, order="C").min((0, 1))
+            a, b = left + straight, left + diagonal
+            a = np.minimum(np.minimum(a[:-2, 1:-1], a[2:, 1:-1]),
+                           np.minimum(a[1:-1, :-2], a[1:-1, 2:]))
+            b = np.minimum(b[:-2], b[2:])
+            b = np.minimum(b[:, :-2], b[:, 2:])
+            left[inner] = np.minimum(a + straight[inner], b + diagonal[inner])
             self.left[self.goal] = self.least
 
     def effort(self, x, y):
         """What a metre costs at x, y (m, arrays), as far as is known: what is not costs 1."""
-        return self.cost[self._squares(x, y)]
+        return self.cost.take(self._at(x, y))
 
     def to_go(self, x, y):
         """What is left from x, y (m, arrays) to the goal, in metres of open ground."""
-        u, v = (np.clip((c / CHART - low) / 2 - 0.5, 0, self.size / 2 - 1.001)
-                for c, low in zip((x, y), self.corner, strict=True))
-        i, j = u.astype(int), v.astype(int)
-        f, g, left = u - i, v - j, self.left
-        return ((1 - f) * ((1 - g) * left[i, j] + g * left[i, j + 1])
-                + f * ((1 - g) * left[i + 1, j] + g * left[i + 1, j + 1]))
+        at = self._squares(x, y) / 2 - 0.5
+        i, j = whole = at.astype(int)
+        f, g = at - whole
+        n, left = self.size // 2, self.left.ravel()
+        k = i * n + j
+        near, far = left.take(k), left.take(k + n)
+        near = near + g * (left.take(k + 1) - near)
+        return near + f * (far + g * (left.take(k + n + 1) - far) - near)
 
 
 # ---------------------------------------------------------------- the training tasks
