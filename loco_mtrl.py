@@ -579,6 +579,7 @@ if "LocoMTRL-v0" not in gymnasium.registry:  # run as a script, this file is imp
 # ------------------------------------------------------------------------------- the guide
 
 PACE = 0.21  # m, the guide's stride where his way is straight
+ASIDE = 0.09  # m, at most, that his left and right strides are shorter and longer in a bend
 
 
 def advise(env):
@@ -596,7 +597,7 @@ def advise(env):
         turn = _LINES[env.whole.argmin()]
     # The strides: slower in a bend, on the spot where the way lies to the side or behind.
     forward = PACE * max(0.0, math.cos(turn)) ** 2
-    aside = 0.2 * min(max(1.2 * turn, -1.0), 1.0)
+    aside = ASIDE * min(max(1.2 * turn, -1.0), 1.0)
     strides = np.array([forward - aside, forward + aside])
     advice[1:3] = np.clip((strides - CENTRE[1:3]) / RANGE[1:3], -0.95, 0.95)
     tilt = math.acos(min(env.up, 1.0))
@@ -830,7 +831,7 @@ def walk_straight(observation, env):
     """Walks straight at the goal on the same trajectory generator: steers, but sees nothing."""
     action = np.zeros(env.action_space.shape)
     heading = observation[env.unwrapped.scan.size + 1]
-    action[1:3] = 0.75 + np.clip(heading, -0.6, 0.6) * np.array([-0.9, 0.9])  # two strides
+    action[1:3] = 0.75 + np.clip(heading, -0.6, 0.6) * np.array([-0.4, 0.4])  # two strides
     return action
 
 

@@ -82,7 +82,10 @@ PHASE_OFFSET = (0.0, math.pi, math.pi, 0.0)  # trot: diagonal legs move together
 DUTY = 0.5  # share of a stride that a foot stands: two feet are down at any time
 OUTWARD = 0.09  # m that feet stand outside their leg plane: 0.06 falls more, 0.12 climbs less
 FORWARD = (0.11, 0.11, -0.05, -0.05)  # m that they stand ahead of their hips: a long one, slopes
+MOST_TURN = 0.5  # rad in a stance, that feet go aside for: further out lie joint limits and falls
 _STANDING_FEET = np.stack([FORWARD, LATERAL + SIDE * OUTWARD, [-CENTRE[4]] * 4], 1)
+_STANDING = _STANDING_FEET.tolist()
+_AHEAD, _LEFT, _ = (HIP_POSITION + _STANDING_FEET).T.tolist()  # of the base's middle
 STANDING = joint_angles(_STANDING_FEET)  # (12,) rad, the pose of a gait without strides
 
 
@@ -90,8 +93,9 @@ class TrajectoryGenerator:
     """Periodic foot paths for a trotting gait, modulated by a policy (paper section 2.2).
 
     A common phase advances at `frequency`; each leg adds its own offset. During stance a foot
-    slides back by the stride length of its side, during swing it returns, lifted along half a
-    sine. Feet become joint angles by inverse kinematics.
+    slides back by the stride length of its side, and where the two differ also aside, around the
+    robot's middle; during swing it returns, lifted along half a sine. Feet become joint angles by
+    inverse kinematics.
 
     Attributes:
         phase: common phase, rad in [0, 2 pi).
@@ -136,17 +140,19 @@ class TrajectoryGenerator:
 
     def _feet(self):
         _, left, right, lift, height = self.parameters
+        # Unlike strides turn the robot, by this angle in a stance, and its feet go in circles about
+        # its middle. In straight lines they would skid: on rough ground it fell as it turned.
+        turn = min(max((right - left) / (_LEFT[1] - _LEFT[0]), -MOST_TURN), MOST_TURN)
         feet = []
-        for offset, stride, forward, lateral, side in zip(
-            PHASE_OFFSET, (right, left, right, left), FORWARD, _LATERAL, _SIDE, strict=True
-        ):
-            cycle = (self.phase + offset) / (2 * math.pi) % 1.0  # 0: touches down
+        for leg, stride in enumerate((right, left, right, left)):
+            cycle = (self.phase + PHASE_OFFSET[leg]) / (2 * math.pi) % 1.0  # 0: touches down
             if cycle < DUTY:
-                x, z = stride * (0.5 - cycle / DUTY), -height
+                part, z = 0.5 - cycle / DUTY, -height
             else:
                 swing = (cycle - DUTY) / (1 - DUTY)
-                x, z = stride * (swing - 0.5), lift * math.sin(math.pi * swing) - height
-            feet.append((forward + x, lateral + side * OUTWARD, z))
+                part, z = swing - 0.5, lift * math.sin(math.pi * swing) - height
+            x, y, _ = _STANDING[leg]
+            feet.append((x + part * stride, y + part * turn * _AHEAD[leg], z))
         return feet
 
     def state(self):

@@ -113,6 +113,29 @@ def test_stance_slides_back_and_swing_lifts():
     assert generator.feet()[0, 0] == pytest.approx(0.11 + 0.065 - 0.13 / 5)
 
 
+@pytest.mark.parametrize("left, right", [(-0.07, 0.07), (0.1, -0.1), (0.06, 0.20)])
+def test_feet_go_in_circles_around_the_middle_of_a_robot_that_turns(left, right):
+    """Against a base that moves by the mean stride and turns: a standing foot stays where it is."""
+    generator, strides = tg.TrajectoryGenerator(), (np.array([left, right]) - 0.13) / 0.27
+    track, ends = 0.41, []  # m, between left and right feet
+    for phase in (0.0, np.pi - 1e-9):  # FR and RL touch down; the same, about to lift off
+        generator.reset(phase)
+        generator.step([0, *strides, 0, 0], 0.0)
+        ends.append((tg.HIP_POSITION + generator.feet())[[0, 3], :2])
+    turn = (right - left) / track
+    for before, after in zip(*ends, strict=True):
+        x, y = (before + after) / 2
+        moved = [(left + right) / 2 - turn * y, turn * x]
+        np.testing.assert_allclose(before - after, moved, atol=0.002)
+
+
+def test_feet_go_aside_for_half_a_radian_at_most():
+    generator = tg.TrajectoryGenerator()
+    generator.step([0, 1, -1, 0, 0], 0.0)  # strides of 0.40 and -0.14 m
+    aside = generator.feet()[:, 1] - tg.LATERAL - 0.09 * tg.SIDE
+    np.testing.assert_allclose(aside, [-0.0773, 0.0773, -0.0720, 0.0720], atol=1e-4)
+
+
 @settings(max_examples=50, deadline=None)
 @given(ACTIONS, st.floats(0, 6.28))
 def test_feet_move_without_jumps(action, phase):
