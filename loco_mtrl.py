@@ -579,7 +579,7 @@ if "LocoMTRL-v0" not in gymnasium.registry:  # run as a script, this file is imp
 # ------------------------------------------------------------------------------- the guide
 
 PACE = 0.21  # m, the guide's stride where his way is straight
-ASIDE = 0.09  # m, at most, that his left and right strides are shorter and longer in a bend
+ASIDE = 0.12  # m, at most, that his left and right strides are shorter and longer in a bend
 
 
 def advise(env):
@@ -654,12 +654,12 @@ def plan(args):
     # later it is 17 s. At last there is little exploration noise: who is used to much of it is not
     # at his best without.
     first = dict(num_steps=256, gamma=0.995, update_epochs=2, learning_rate=5e-4, target_kl=0.05)
-    last = first | dict(num_steps=512, gamma=0.998, target_kl=0.02, max_std=0.15)
+    last = first | dict(num_steps=512, gamma=0.998, target_kl=0.02, max_std=0.10)
     if args.tg and "guide" not in args.paper:
         # Advice has no noise that a trust region would have to guard against: a step size of 1e-3,
         # whatever the KL.
         rates = "learning_rate", "min_learning_rate", "max_learning_rate"
-        first |= dict.fromkeys(rates, 1e-3) | dict(guide_share=1.0, target_kl=1e9, max_std=0.2)
+        first |= dict.fromkeys(rates, 1e-3) | dict(guide_share=1.0, target_kl=1e9, max_std=0.12)
         last |= dict(guide_share=0.5, min_learning_rate=1e-5, learning_rate=1e-4,
                      max_learning_rate=1e-4)
     if args.sequential:  # one task after the other (section 3), each for as long
