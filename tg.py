@@ -84,7 +84,7 @@ OUTWARD = 0.09  # m that feet stand outside their leg plane: 0.06 falls more, 0.
 FORWARD = (0.11, 0.11, -0.05, -0.05)  # m that they stand ahead of their hips: a long one, slopes
 MOST_TURN = 0.5  # rad in a stance, that feet go aside for: further out lie joint limits and falls
 _STANDING_FEET = np.stack([FORWARD, LATERAL + SIDE * OUTWARD, [-CENTRE[4]] * 4], 1)
-_STANDING = _STANDING_FEET.tolist()
+_FEET = _STANDING_FEET.tolist()
 _AHEAD, _LEFT, _ = (HIP_POSITION + _STANDING_FEET).T.tolist()  # of the base's middle
 STANDING = joint_angles(_STANDING_FEET)  # (12,) rad, the pose of a gait without strides
 
@@ -151,7 +151,7 @@ class TrajectoryGenerator:
             else:
                 swing = (cycle - DUTY) / (1 - DUTY)
                 part, z = swing - 0.5, lift * math.sin(math.pi * swing) - height
-            x, y, _ = _STANDING[leg]
+            x, y, _ = _FEET[leg]
             feet.append((x + part * stride, y + part * turn * _AHEAD[leg], z))
         return feet
 

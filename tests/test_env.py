@@ -351,10 +351,7 @@ def test_the_guide_turns_to_the_goal(yaw, turns):
         place(env.unwrapped, x, y, 0.35, yaw=math.atan2(goal[1] - y, goal[0] - x) + yaw)
         *_, info = env.step(np.zeros(17))
         left, right = 0.13 + 0.27 * info["guide"][1:3]  # m
-        if turns:
-            assert np.sign(right - left) == turns and abs(right - left) > 0.3
-        else:
-            assert abs(right - left) < 0.05
+        assert right - left == pytest.approx(0.24 * turns, abs=0.05)
         assert (left + right) / 2 == pytest.approx(0.21 * max(0, math.cos(yaw)) ** 2, abs=0.05)
 
 
