@@ -201,7 +201,7 @@ def fuse_pillars(heights, l, w):  # noqa: E741 - the paper's own names
 
 
 def _window(a, radius, pick):
-    """`pick` (np.maximum or np.minimum) over the square of +-`radius` cells around each cell."""
+    """`pick` (np.maximum or the like) over the square of +-`radius` cells around each cell."""
     for _ in range(2):
         a = a.take(np.arange(-radius, len(a) + radius), 0, mode="clip")  # the rim goes on
         width = 1  # cells that each entry stands for; doubled, and at last made 2 * radius + 1
@@ -360,8 +360,7 @@ class Chart:
         np.fmin.at(self.below, self._at(x, y), level)
 
     def _clear(self, eyes, way, spared):
-        """Lowers what long rays pass through, up to `spared` m before their ends: people move on.
-        """
+        """Lowers what long rays pass through, `spared` m from their ends apart: people move on."""
         length = np.hypot(way[:, 0], way[:, 1])
         far = length > LONG
         length, end = length[far, None], (length - spared)[far, None]
