@@ -149,31 +149,6 @@ def lidar_rays():
     return np.where(directions[:, :1] > 0, LIDAR_FRONT, LIDAR_REAR), directions
 
 
-# The chart: a map that the robot draws as it goes (terrain.Chart), drawn anew every CHART_EVERY
-# control steps. Along each column of the scan it is told the effort of going as far as CHART_RADII
-# (m), and what the best place on that line would cost in all: see `weigh_ways`.
-CHART_RADII, CHART_EVERY = (0.6, 1.5, 2.7, 4.5), 10
-_LINES = np.radians(LIDAR_AZIMUTHS[0])
-_PACES = np.arange(0.3, 4.6, 0.3)  # m, the places on a line
-_PLACES, _TURN = _PACES[:, None] * np.exp(1j * _LINES), 0.3 * np.abs(_LINES) / np.pi
-_CHARTED = np.isin(np.round(_PACES, 1), CHART_RADII)
-LOG_WALL = math.log1p(225)  # all the way in a wall: what is observed are logarithms, in [0, 1]
-
-
-def weigh_ways(chart, x, y, yaw):
-    """What it would take, by the map, to go straight along each of the scan's columns from x, y.
-
-    Returns, in metres of open ground, the effort of going as far as each of _PACES (15, 24); and
-    the least that going by each column costs in all (24,): the effort to some place on it, from
-    0.6 m on, what is left from there to the goal, and up to 0.3 m for the turn.
-    """
-    places = complex(x, y) + cmath.rect(1.0, yaw) * _PLACES
-    x, y = places.real, places.imag
-    way = 0.3 * chart.effort(x, y).cumsum(0)
-    whole = (way + chart.to_go(x, y))[1:].min(0)  # nearer, all columns would look alike
-    return way, whole + _TURN
-
-
 # ------------------------------------------------------------------------------- the environment
 
 SUBSTEPS, DT = 5, 1 / 30  # physics steps in a control step, and its length in s
@@ -187,8 +162,6 @@ POSITION_GAIN, VELOCITY_GAIN = 0.10, 1.0
 SMOOTHING = np.array([0.2] * TrajectoryGenerator.action_size + [0.5] * 12)
 RESIDUAL = {True: 0.1, False: 0.6}  # rad, largest u_fb with the TG, and without
 GOAL_RADIUS = 0.5  # m, r_g
-# What the paper has not: a guide in training (`Guide`), and a map among what the robot observes.
-OURS = ("guide", "map")
 BASE_HEIGHT = 0.30  # m, of the walking base: a goal floats that high over the ground
 EXPLODED = 1e3  # m or rad/s
 # A person who meets more resistance steps back. A body that is moved regardless pushes with any
@@ -210,21 +183,17 @@ def _about_z(yaw):
 class LocoEnv(gymnasium.Env):
     """A Laikago walks to a goal over terrain that only its LiDAR shows it (section 2).
 
-    ## Observation: Box((402,), float32), in the order of section 2.1
+    ## Observation: Box((282,), float32), in the order of section 2.1
     | entries | meaning | unit |
     |---|---|---|
     | 240 | r, LiDAR scan: sqrt(distance / 5 m), 1: no hit; rows from low to high, left to right | |
-    | 96 | chart: effort of 0.6, 1.5, 2.7, 4.5 m along each column in its own map; ours | * |
-    | 24 | what going each column's way costs in all, less the cheapest: `weigh_ways`; ours | * |
     | 1 | g_d, distance to the goal | m |
     | 1 | g_h, heading of the goal relative to the robot's, left positive | rad |
     | 3 | angular rates of the base in its own frame (IMU) | rad/s |
     | 12 | q, joint angles: FR, FL, RR, RL x abduction, hip, knee | rad |
     | 12 | a_{t-1}, joint targets commanded in the previous step | rad |
     | 13 | s_tg, state of the trajectory generator; none with tg=False | |
-    *: log(1 + metres of open ground) / log(226), in [0, 1]. The paper's robot draws no map:
-    paper=["map"] leaves chart and ways out, lidar=False all that is seen. That is taken at 15 Hz,
-    all else at 30 Hz.
+    The scan is taken at 15 Hz, all else at 30 Hz; with lidar=False there is none. `Map` adds to it.
 
     ## Action: Box(-1, 1, (17,), float32), clipped to that range, then smoothed
     5 parameters of the trajectory generator (`tg.PARAMETERS`), then the 12 residuals u_fb;
@@ -248,7 +217,6 @@ class LocoEnv(gymnasium.Env):
             of these; None: all pillar tasks. The policy is not told which.
         difficulty: in [0, 1], or (low, high) to draw it from, once for each terrain.
         tg, lidar: the paper's ablations (section 3) leave one of them out.
-        paper: which parts of OURS are left out, as in the paper; without both, no map is drawn.
         terrains: how many terrains of each task to build; Bullet never frees a mesh, so the pool
             is built once. An episode takes the one that has had least time so far, and chance
             decides between equals. A finished Terrain counts once.
@@ -261,8 +229,8 @@ class LocoEnv(gymnasium.Env):
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": round(1 / DT)}
 
-    def __init__(self, tasks=None, difficulty=(0.0, 1.0), tg=True, lidar=True, paper=(),
-                 terrains=1, pool_seed=0, render_mode=None, gui=False):
+    def __init__(self, tasks=None, difficulty=(0.0, 1.0), tg=True, lidar=True, terrains=1,
+                 pool_seed=0, render_mode=None, gui=False):
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
         low, high = difficulty if np.size(difficulty) == 2 else (difficulty, difficulty)
@@ -270,8 +238,6 @@ class LocoEnv(gymnasium.Env):
             raise ValueError(f"difficulty must be in [0, 1] or (low, high), got {difficulty}")
         if not isinstance(terrains, int) or terrains < 1:
             raise ValueError(f"terrains must be a whole number of at least 1, got {terrains!r}")
-        if not isinstance(paper, (list, tuple)) or not all(part in OURS for part in paper):
-            raise ValueError(f"paper must list some of {', '.join(OURS)}, got {paper!r}")
         self.render_mode, self.show_lidar, self.lidar = render_mode, False, lidar
         tasks = list(PILLAR_TASKS) if tasks is None else tasks
         tasks = tasks if isinstance(tasks, (list, tuple)) else [tasks]
@@ -283,9 +249,7 @@ class LocoEnv(gymnasium.Env):
         self.generator = TrajectoryGenerator() if tg else None
         self._connect(gui)
         rows, columns = LIDAR_AZIMUTHS.shape
-        self.charted = lidar and "map" not in paper  # the robot observes its map
-        self.charting = not {"guide", "map"} <= set(paper)  # it draws one, at least for the guide
-        self.scan_shape = rows * lidar + (len(CHART_RADII) + 1) * self.charted, columns
+        self.scan_shape = rows * lidar, columns
         n_scan = math.prod(self.scan_shape)
         self.scan = np.zeros(n_scan, np.float32)
         # Generous bounds: what lies beyond them is no longer a robot, and the episode ends.
@@ -329,8 +293,7 @@ class LocoEnv(gymnasium.Env):
         if visual:
             sphere = p.createVisualShape(p.GEOM_SPHERE, radius=0.2, rgbaColor=(0.2, 0.8, 0.3, 1))
             self.flag = p.createMultiBody(0, -1, sphere)
-        self._eyes, self._reach = sources, LIDAR_RANGE * directions
-        self._rays = sources.tolist(), (sources + self._reach).tolist()
+        self._rays = sources.tolist(), (sources + LIDAR_RANGE * directions).tolist()
         self._gains = dict(positionGains=[POSITION_GAIN] * 12, velocityGains=[VELOCITY_GAIN] * 12,
                            forces=[MAX_TORQUE] * 12)
         for _ in range(3):  # Bullet files what stands still elsewhere after two steps: it would
@@ -410,7 +373,6 @@ class LocoEnv(gymnasium.Env):
         for joint, angle in zip(self.joints, self.target, strict=True):
             p.resetJointState(self.robot, joint, angle)
         self.time, self.steps, self.collisions = 0.0, 0, 0
-        self.chart, self.scans = Chart(*position[:2], self.goal), []  # seen, not on the chart yet
         self.touching = self.exploded = False
         self.walked = np.zeros(len(self.people))  # seconds that each of them has been walking
         for body in self.people:  # not all terrains have as many
@@ -478,7 +440,7 @@ class LocoEnv(gymnasium.Env):
         position, quaternion = p.getBasePositionAndOrientation(self.robot)
         self.velocity, self.rates = p.getBaseVelocity(self.robot)
         r = p.getMatrixFromQuaternion(quaternion)
-        self.position, self.up = position, r[8]
+        self.position, self.rotation, self.up = position, r, r[8]
         self.distance = math.dist(self.goal, position)
         self.yaw = math.atan2(r[3], r[0])
         heading = math.atan2(self.goal[1] - position[1], self.goal[0] - position[0]) - self.yaw
@@ -491,37 +453,14 @@ class LocoEnv(gymnasium.Env):
             state += self.generator.state()
         observation = np.empty(self.observation_space.shape, dtype=np.float32)
         observation[self.scan.size :] = state
-        if turn_lidar and math.isfinite(self.distance):
-            self._look(r)
-        observation[: self.scan.size] = self.scan
-        return observation
-
-    def _look(self, r):
-        """Turns the LiDAR once, draws what it sees, weighs the ways. r: the base's rotation (9,)"""
-        p, (x, y, z) = self.bullet, self.position
-        if self.lidar:
+        if turn_lidar and self.lidar and math.isfinite(self.distance):
             self.hits = p.rayTestBatch(*self._rays, parentObjectUniqueId=self.robot,
                                        parentLinkIndex=-1, collisionFilterMask=STATIC_GROUP)
+            self.fractions = np.fromiter(map(HIT_FRACTION, self.hits), np.float32, N_RAYS)
             # The root: as fine as a scan of 3 m is near by, and yet it looks across a room.
-            fractions = np.fromiter(map(HIT_FRACTION, self.hits), np.float32, N_RAYS)
-            self.scan[:N_RAYS] = np.sqrt(fractions)
-        if not self.charting:
-            return
-        if self.lidar:
-            self.scans.append((fractions, r, self.position))
-            if self.steps % CHART_EVERY == 0:
-                fractions, turns, places = map(np.array, zip(*self.scans, strict=True))
-                turns = turns.reshape(-1, 3, 3).transpose(0, 2, 1)
-                eyes = self._eyes @ turns + places[:, None]
-                hits = eyes + fractions[..., None] * (self._reach @ turns)
-                self.chart.see(eyes.reshape(-1, 3), hits.reshape(-1, 3), fractions.ravel() < 1,
-                               z - BASE_HEIGHT)
-                self.chart.draw(x, y, z - BASE_HEIGHT)
-                self.scans.clear()
-        way, self.whole = weigh_ways(self.chart, x, y, self.yaw)
-        if self.charted:
-            costs = np.append(way[_CHARTED], self.whole - self.whole.min())
-            self.scan[N_RAYS:] = np.log1p(costs) / LOG_WALL
+            self.scan = np.sqrt(self.fractions)
+        observation[: self.scan.size] = self.scan
+        return observation
 
     def render(self):
         """The robot from above and behind, as uint8 (300, 400, 3).
@@ -547,24 +486,6 @@ class LocoEnv(gymnasium.Env):
                 picture[i[seen], j[seen]] = (220, 30, 30)
         return picture
 
-    def mirror(self):
-        """The left-right symmetry: mirrored, o becomes o[i] * s and an action a becomes a[j] * t.
-
-        Returns:
-            (i, s, j, t): indices and signs over the observation, then over the action.
-        """
-        legs = np.arange(12).reshape(4, 3)[[1, 0, 3, 2]].ravel()  # joint angles mirror unsigned
-        swap, tg = np.array([1, 0, 3, 2]), bool(self.generator)
-        parameters = np.array([0, 2, 1, 3, 4])  # left and right stride change places
-        scan = np.arange(self.scan.size).reshape(self.scan_shape)[:, ::-1].ravel()
-        parts = [scan, np.arange(5), legs, legs] + [swap, swap, parameters] * tg
-        actions = [parameters] * tg + [legs]
-        signs = np.ones(self.observation_space.shape)
-        signs[scan.size + np.array([1, 2, 4])] = -1  # heading, roll rate, yaw rate
-        chain = [np.concatenate([p + sum(map(len, group[:k])) for k, p in enumerate(group)])
-                 for group in (parts, actions)]
-        return chain[0], signs, chain[1], np.ones(self.action_space.shape)
-
     def close(self):
         if self.bullet is not None:
             with _quiet():  # the window says goodbye at length
@@ -576,31 +497,117 @@ if "LocoMTRL-v0" not in gymnasium.registry:  # run as a script, this file is imp
     gymnasium.register("LocoMTRL-v0", "loco_mtrl:LocoEnv", max_episode_steps=MAX_EPISODE_STEPS)
 
 
-# ------------------------------------------------------------------------------- the guide
+# ------------------------------------------------------------------------------- ours: map, guide
+
+# What the paper has not: a guide in training (`Guide`), and a map among what the robot observes.
+OURS = ("guide", "map")
+CHART_RADII, CHART_EVERY = (0.6, 1.5, 2.7, 4.5), 10
+_LINES = np.radians(LIDAR_AZIMUTHS[0])
+_PACES = np.arange(0.3, 4.6, 0.3)  # m, the places on a line
+_PLACES, _TURN = _PACES[:, None] * np.exp(1j * _LINES), 0.3 * np.abs(_LINES) / np.pi
+_CHARTED = np.isin(np.round(_PACES, 1), CHART_RADII)
+LOG_WALL = math.log1p(225)  # all the way in a wall: what is observed are logarithms, in [0, 1]
+
+
+def weigh_ways(chart, x, y, yaw):
+    """What it would take, by the map, to go straight along each of the scan's columns from x, y.
+
+    Returns, in metres of open ground, the effort of going as far as each of _PACES (15, 24); and
+    the least that going by each column costs in all (24,): the effort to some place on it, from
+    0.6 m on, what is left from there to the goal, and up to 0.3 m for the turn.
+    """
+    places = complex(x, y) + cmath.rect(1.0, yaw) * _PLACES
+    x, y = places.real, places.imag
+    way = 0.3 * chart.effort(x, y).cumsum(0)
+    whole = (way + chart.to_go(x, y))[1:].min(0)  # nearer, all columns would look alike
+    return way, whole + _TURN
+
+
+class Map(gymnasium.Wrapper):
+    """A robot that draws a map from its LiDAR's hits as it goes, `terrain.Chart`: ours.
+
+    ## Observation: Box((402,), float32): LocoEnv's, and after its scan
+    | entries | meaning | unit |
+    |---|---|---|
+    | 96 | effort of going 0.6, 1.5, 2.7, 4.5 m along each of the scan's columns | * |
+    | 24 | what going each column's way costs in all, less the cheapest: `weigh_ways` | * |
+    *: log(1 + metres of open ground) / log(226), in [0, 1]. Taken with each scan, at 15 Hz; the map
+    is drawn anew every CHART_EVERY control steps.
+
+    observed: False: the map is drawn, for a guide, but the observation remains LocoEnv's.
+    """
+
+    def __init__(self, env, observed=True):
+        super().__init__(env)
+        self.robot, self.observed = env.unwrapped, observed
+        (rows, columns), space = self.robot.scan_shape, env.observation_space
+        self.n_scan, n_map = rows * columns, (len(CHART_RADII) + 1) * columns * observed
+        self.scan_shape = rows + n_map // columns, columns
+        low, high = (np.insert(bound, self.n_scan, np.full(n_map, limit))
+                     for bound, limit in ((space.low, 0), (space.high, 1)))
+        self.observation_space = gymnasium.spaces.Box(low, high)
+        self.eyes, directions = lidar_rays()
+        self.reach = LIDAR_RANGE * directions
+
+    def reset(self, **kwargs):
+        observation, info = self.env.reset(**kwargs)
+        self.chart = Chart(*self.robot.position[:2], self.robot.goal)
+        self.scans = []  # seen, not on the chart yet
+        return self._look(observation), info
+
+    def step(self, action):
+        observation, *rest = self.env.step(action)
+        return self._look(observation), *rest
+
+    def _look(self, observation):
+        """Draws what the LiDAR has just seen and weighs the ways: the observation with them."""
+        robot, (x, y, z) = self.robot, self.robot.position
+        if robot.exploded:
+            self.seen = np.zeros_like(self.seen)
+        elif robot.steps % LIDAR_EVERY == 0:
+            self.scans.append((robot.fractions, robot.rotation, robot.position))
+            if robot.steps % CHART_EVERY == 0:
+                fractions, turns, places = map(np.array, zip(*self.scans, strict=True))
+                turns = turns.reshape(-1, 3, 3).transpose(0, 2, 1)
+                eyes = self.eyes @ turns + places[:, None]
+                hits = eyes + fractions[..., None] * (self.reach @ turns)
+                self.chart.see(eyes.reshape(-1, 3), hits.reshape(-1, 3), fractions.ravel() < 1,
+                               z - BASE_HEIGHT)
+                self.chart.draw(x, y, z - BASE_HEIGHT)
+                self.scans.clear()
+            way, self.whole = weigh_ways(self.chart, x, y, robot.yaw)
+            costs = np.append(way[_CHARTED], self.whole - self.whole.min())
+            self.seen = np.float32(np.log1p(costs) / LOG_WALL)
+        if not self.observed:
+            return observation
+        scan, rest = observation[: self.n_scan], observation[self.n_scan :]
+        return np.concatenate([scan, self.seen, rest])
+
 
 PACE = 0.21  # m, the guide's stride where his way is straight
 ASIDE = 0.12  # m, at most, that his left and right strides are shorter and longer in a bend
 
 
 def advise(env):
-    """What a guide would do: take the cheapest of the ways that the robot's own map shows.
+    """What a guide would do: take the cheapest of the ways that the robot's own `Map` shows.
 
-    Without a map he heads for the goal; on a slope he crouches. Returns an action (n_act,), NaN for
+    Without one he heads for the goal; on a slope he crouches. Returns an action (n_act,), NaN for
     all but two strides and the stance height.
     """
-    advice = np.full(env.action.shape, np.nan)
-    if env.exploded:
+    robot = env.unwrapped
+    advice = np.full(robot.action.shape, np.nan)
+    if robot.exploded:
         return advice
-    (x, y, _), (to_x, to_y, _) = env.position, env.goal
-    turn = math.remainder(math.atan2(to_y - y, to_x - x) - env.yaw, 2 * math.pi)
-    if env.charting and env.distance > 0.7:
-        turn = _LINES[env.whole.argmin()]
+    (x, y, _), (to_x, to_y, _) = robot.position, robot.goal
+    turn = math.remainder(math.atan2(to_y - y, to_x - x) - robot.yaw, 2 * math.pi)
+    if robot.distance > 0.7 and env.has_wrapper_attr("whole"):
+        turn = _LINES[env.get_wrapper_attr("whole").argmin()]
     # The strides: slower in a bend, on the spot where the way lies to the side or behind.
     forward = PACE * max(0.0, math.cos(turn)) ** 2
     aside = ASIDE * min(max(1.2 * turn, -1.0), 1.0)
     strides = np.array([forward - aside, forward + aside])
     advice[1:3] = np.clip((strides - CENTRE[1:3]) / RANGE[1:3], -0.95, 0.95)
-    tilt = math.acos(min(env.up, 1.0))
+    tilt = math.acos(min(robot.up, 1.0))
     advice[4] = -min(max(5 * (tilt - 0.1), 0.0), 0.95)
     return advice
 
@@ -614,11 +621,43 @@ class Guide(gymnasium.Wrapper):
 
     def reset(self, **kwargs):
         observation, info = self.env.reset(**kwargs)
-        return observation, info | {"guide": advise(self.unwrapped)}
+        return observation, info | {"guide": advise(self)}
 
     def step(self, action):
         *rest, info = self.env.step(action)
-        return *rest, info | {"guide": advise(self.unwrapped)}
+        return *rest, info | {"guide": advise(self)}
+
+
+def make_env(tasks, lidar=True, paper=(), guide=False, **options):
+    """A robot as in training and scoring: LocoMTRL-v0, in a `Map` and with a `Guide`.
+
+    paper: which of OURS it does without; a blind one has no map. options: LocoEnv's.
+    """
+    env = gymnasium.make("LocoMTRL-v0", tasks=tasks, lidar=lidar, disable_env_checker=True,
+                         **options)
+    if lidar and (guide or "map" not in paper):
+        env = Map(env, observed="map" not in paper)
+    return Guide(env) if guide else env
+
+
+def mirror(env):
+    """The left-right symmetry: mirrored, o becomes o[i] * s and an action a becomes a[j] * t.
+
+    Returns:
+        (i, s, j, t): indices and signs over the observation, then over the action.
+    """
+    legs = np.arange(12).reshape(4, 3)[[1, 0, 3, 2]].ravel()  # joint angles mirror unsigned
+    swap, tg = np.array([1, 0, 3, 2]), bool(env.unwrapped.generator)
+    parameters = np.array([0, 2, 1, 3, 4])  # left and right stride change places
+    shape = env.get_wrapper_attr("scan_shape")
+    scan = np.arange(math.prod(shape)).reshape(shape)[:, ::-1].ravel()
+    parts = [scan, np.arange(5), legs, legs] + [swap, swap, parameters] * tg
+    actions = [parameters] * tg + [legs]
+    signs = np.ones(env.observation_space.shape)
+    signs[scan.size + np.array([1, 2, 4])] = -1  # heading, roll rate, yaw rate
+    chain = [np.concatenate([p + sum(map(len, group[:k])) for k, p in enumerate(group)])
+             for group in (parts, actions)]
+    return chain[0], signs, chain[1], np.ones(env.action_space.shape)
 
 
 # ------------------------------------------------------------------------------- train
@@ -630,15 +669,13 @@ HARD = (0.4, 1.0)  # ... and then from here
 LAYOUTS = 10  # of an environment, at most: the more it sees, the less it learns by heart
 
 
-def training_env(index, seed, tasks, guide=False, stage=0, **options):
+def training_env(index, seed, tasks, stage=0, **options):
     """Environment number `index` over all ranks: one of the tasks, on layouts of its own.
 
     So all tasks have the same share of every batch, but for what does not divide evenly.
     """
-    env = gymnasium.make("LocoMTRL-v0", disable_env_checker=True,
-                         pool_seed=(seed, stage, index), tasks=tasks[index % len(tasks)],
-                         terrains=min(len(tasks), LAYOUTS), **options)
-    env = Guide(env) if guide else env
+    env = make_env(tasks[index % len(tasks)], terrains=min(len(tasks), LAYOUTS),
+                   pool_seed=(seed, stage, index), **options)
     return gymnasium.wrappers.TransformReward(env, lambda reward: REWARD_SCALE * reward)
 
 
@@ -678,8 +715,8 @@ def train(args):
             "seed": args.seed, "command": shlex.join(["python", "loco_mtrl.py", *args.argv]),
             "commit": _commit()}
     stages = plan(args)
-    with contextlib.closing(LocoEnv("flat", **options)) as env:
-        mirror, scan = env.mirror(), env.scan_shape
+    with contextlib.closing(make_env("flat", **options)) as env:
+        symmetry, scan = mirror(env), env.get_wrapper_attr("scan_shape")
     n_tg = TrajectoryGenerator.action_size * args.tg
     # Without the generator the joints' actions are worth six times as many radians.
     init_std = (0.37,) * n_tg + (0.37 if args.tg else 0.25,) * 12
@@ -704,9 +741,9 @@ def train(args):
                 init_std=init_std, noise_correlation=noise_correlation,
                 gae_lambda=0.98, max_advantage=1.0, **settings,
             )
-            make_env = partial(training_env, seed=args.seed, tasks=tasks, stage=k,
+            training = partial(training_env, seed=args.seed, tasks=tasks, stage=k,
                                guide=config.guide_share > 0, difficulty=difficulty, **options)
-            learn(make_env, config, run_dir=run_dir, resume=resume, mirror=mirror, meta=meta,
+            learn(training, config, run_dir=run_dir, resume=resume, mirror=symmetry, meta=meta,
                   episode_keys=("t_cr", "success", "fall", "exploded"), groups=args.tasks,
                   on_update=on_update)
     except KeyboardInterrupt:
@@ -830,21 +867,21 @@ def zero_action(observation, env):
 def walk_straight(observation, env):
     """Walks straight at the goal on the same trajectory generator: steers, but sees nothing."""
     action = np.zeros(env.action_space.shape)
-    heading = observation[env.unwrapped.scan.size + 1]
+    heading = observation[math.prod(env.get_wrapper_attr("scan_shape")) + 1]
     action[1:3] = 0.75 + np.clip(heading, -0.6, 0.6) * np.array([-0.4, 0.4])  # two strides
     return action
 
 
 def follow_guide(observation, env):
     """The guide himself: the ways that the map shows, no learning, on the same generator."""
-    return np.nan_to_num(advise(env.unwrapped))
+    return np.nan_to_num(advise(env))
 
 
 REFERENCES = {"zero": zero_action, "straight": walk_straight, "guide": follow_guide}
 
 
 def load_actor(name):
-    """(act, options, row): `act(observation, env)`, LocoEnv's options, the name of its row in
+    """(act, options, row): `act(observation, env)`, make_env's options, the name of its row in
     PAPER, if it is there.
 
     `name` is a checkpoint's path or one of REFERENCES. Raises as `load_checkpoint` does.
@@ -856,10 +893,10 @@ def load_actor(name):
     if not {"tg", "lidar", "paper", "tasks", "sequential"} <= set(meta):
         raise ValueError(f"{name} is not a policy for LocoEnv: {meta}")
     options, tasks = {k: meta[k] for k in ("tg", "lidar", "paper")}, meta["tasks"]
-    with contextlib.closing(LocoEnv("flat", **options)) as env:
+    with contextlib.closing(make_env("flat", **options)) as env:
         size, given = env.observation_space.shape[0], model.kwargs["obs_dim"]
     if size != given:
-        raise ValueError(f"{name} takes observations of {given} numbers, LocoEnv gives {size}")
+        raise ValueError(f"{name} takes observations of {given} numbers, a robot here gives {size}")
     kinds = {"reactive": not meta["tg"], "no vision": not meta["lidar"],
              "sequential": meta["sequential"], tasks[0]: len(tasks) == 1, "ours": True}
     row = next(kind for kind, holds in kinds.items() if holds)
@@ -883,8 +920,7 @@ def episodes(job):
     terrain, results = make_place(place, seed), []
     for actor in actors:
         act, options, _ = load_actor(actor)
-        env = gymnasium.make("LocoMTRL-v0", tasks=terrain, disable_env_checker=True,
-                             max_episode_steps=round(EVAL_SECONDS / DT), **options)
+        env = make_env(terrain, max_episode_steps=round(EVAL_SECONDS / DT), **options)
         observation, info = env.reset(seed=seed)
         terminated = truncated = False
         while not (terminated or truncated):
@@ -980,8 +1016,7 @@ def play(args):
 
         Path(args.gif).open("a").close()
     options |= {"gui": True} if args.gui else {"render_mode": "rgb_array"}
-    env = gymnasium.make("LocoMTRL-v0", tasks=terrain, disable_env_checker=True,
-                         max_episode_steps=round(EVAL_SECONDS / DT), **options)
+    env = make_env(terrain, max_episode_steps=round(EVAL_SECONDS / DT), **options)
     robot = env.unwrapped
     robot.show_lidar = args.lidar
     observation, info = env.reset(seed=args.seed)

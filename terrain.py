@@ -731,8 +731,8 @@ for _task in (obstacles, poles, corridors, walls, rooms, mazes, screens, traps):
     _task.fence = True  # walls all around: who looks for a way must not fall off the world
 
 PILLAR_TASKS = {task.__name__: task for task in (
-    flat, rugged, holes, obstacles, poles, stairs, stones, slopes, hills, pyramids_up,
-    pyramids_down, gaps, hurdles, ridges, pits, coasts, corridors, walls, rooms, mazes,
+    flat, rugged, holes, obstacles, poles, stairs, stones, hills, slopes, pyramids_up,
+    pyramids_down, gaps, hurdles, ridges, pits, coasts, walls, corridors, rooms, mazes,
     screens, traps, blocks, waves, crags)}
 
 

@@ -62,7 +62,7 @@ def walk(env, steps, spent=None):
     rng = np.random.default_rng(0)
     env.reset(seed=0)
     for name in ("stepSimulation", "rayTestBatch") if spent is not None else ():
-        timed(env.bullet, name, spent)
+        timed(env.unwrapped.bullet, name, spent)
     resets, elapsed = [], 0.0
     for _ in range(steps):
         action = rng.normal(0, 0.2, env.action_space.shape)
@@ -137,8 +137,8 @@ def show(name, value):
 
 
 def main():
-    for label, paper in (("as the paper's", loco_mtrl.OURS), ("with the map", ())):
-        spent, env = {}, LocoEnv("rugged", difficulty=0.5, paper=paper)
+    for label, wrap in (("LocoEnv", lambda env: env), ("with a Map around", loco_mtrl.Map)):
+        spent, env = {}, wrap(LocoEnv("rugged", difficulty=0.5))
         step, reset = walk(env, STEPS)
         measured, _ = walk(env, STEPS, spent)
         env.close()

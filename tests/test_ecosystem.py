@@ -15,11 +15,14 @@ ROOT = Path(loco_mtrl.__file__).parent
 
 
 @pytest.mark.parametrize("vector", [gym.vector.SyncVectorEnv, gym.vector.AsyncVectorEnv])
-def test_vector_envs_and_wrappers(vector):
-    make = partial(gym.make, "LocoMTRL-v0", tasks="flat", max_episode_steps=5)
+@pytest.mark.parametrize(("maker", "size"), [
+    (partial(gym.make, "LocoMTRL-v0"), 282), (loco_mtrl.make_env, 402),
+])
+def test_vector_envs_and_wrappers(vector, maker, size):
+    make = partial(maker, tasks="flat", max_episode_steps=5)
     envs = gym.wrappers.vector.RecordEpisodeStatistics(vector([make, make]))
     observations, _ = envs.reset(seed=3)
-    assert observations.shape == (2, 402) and observations.dtype == np.float32
+    assert observations.shape == (2, size) and observations.dtype == np.float32
     total = np.zeros(2)
     for _ in range(5):
         _, reward, terminated, truncated, info = envs.step(np.zeros((2, 17), np.float32))

@@ -22,12 +22,15 @@ from loco_mtrl import (
     N_RAYS,
     Guide,
     LocoEnv,
+    Map,
+    make_env,
+    mirror,
     training_env,
 )
 
 SHAPE = (60, 40)
 N_CHART = 24 * len(loco_mtrl.CHART_RADII)
-N_SCAN = N_RAYS + N_CHART + 24
+N_MAP = N_CHART + 24
 
 
 def wall_ahead(rng, difficulty):
@@ -65,20 +68,45 @@ def place(env, x, y, z, yaw=0.0, roll=0.0):
     return env._observe()
 
 
-OPTIONS = {}, {"tg": False}, {"lidar": False}, {"paper": loco_mtrl.OURS}, {"paper": ["map"]}
-
-
-@pytest.mark.parametrize("options", OPTIONS)
+@pytest.mark.parametrize("options", [{}, {"tg": False}, {"lidar": False}])
 def test_gymnasium_checks_pass_without_a_warning(options):
     env = gymnasium.make("LocoMTRL-v0", tasks="rugged", render_mode="rgb_array", **options)
     check_env(env.unwrapped)
     env.close()
 
 
+@pytest.mark.parametrize("observed", [True, False])
+def test_gymnasium_checks_pass_with_a_map(observed):
+    with closing(Map(LocoEnv("rugged"), observed)) as env:
+        with pytest.warns(UserWarning, match="different from the unwrapped version"):  # and no more
+            check_env(env, skip_render_check=True)
+
+
+@pytest.mark.parametrize(("options", "size", "mapped"), [
+    ({}, 402, True), ({"paper": ["guide"]}, 402, True), ({"paper": ["map"]}, 282, False),
+    ({"paper": ["map"], "guide": True}, 282, True), ({"lidar": False}, 42, False),
+    ({"lidar": False, "guide": True}, 42, False), ({"tg": False}, 389, True),
+])
+def test_what_robots_of_each_kind_observe(options, size, mapped):
+    with closing(make_env("flat", **options)) as env:
+        observation, info = env.reset(seed=0)
+        assert observation.shape == (size,) and observation in env.observation_space
+        assert env.has_wrapper_attr("whole") == mapped
+        assert ("guide" in info) == options.get("guide", False)
+
+
+def test_a_map_comes_after_the_scan_and_changes_nothing_else(flat):
+    bare, _ = flat.reset(seed=3)
+    mapped, _ = Map(flat).reset(seed=3)
+    assert mapped.dtype == np.float32
+    np.testing.assert_array_equal(np.delete(mapped, N_RAYS + np.arange(N_MAP)), bare)
+    np.testing.assert_array_equal(Map(flat, observed=False).reset(seed=3)[0], bare)
+
+
 def test_observation_has_the_papers_parts_in_its_order(flat):
     observation, _ = flat.reset(seed=3)
     scan, goal, rates, joints, target, s_tg = np.split(
-        observation, np.cumsum([N_SCAN, 2, 3, 12, 12])
+        observation, np.cumsum([N_RAYS, 2, 3, 12, 12])
     )
     assert scan.min() >= 0 and scan.max() <= 1
     assert goal[0] == pytest.approx(np.linalg.norm(np.subtract(flat.goal, flat.position)))
@@ -90,7 +118,7 @@ def test_observation_has_the_papers_parts_in_its_order(flat):
 def test_heading_is_left_positive_and_relative_to_the_robot(flat):
     flat.reset(seed=0)
     flat.goal = flat.origin + [6.0, 2.0, 0.5]
-    heading = lambda yaw: place(flat, 6.0, 0.0, 0.5, yaw)[N_SCAN + 1]  # noqa: E731
+    heading = lambda yaw: place(flat, 6.0, 0.0, 0.5, yaw)[N_RAYS + 1]  # noqa: E731
     assert heading(0.0) == pytest.approx(np.pi / 2, abs=1e-6)
     assert heading(np.pi / 2) == pytest.approx(0.0, abs=1e-6)
     assert heading(-np.pi / 4) == pytest.approx(3 * np.pi / 4, abs=1e-6)
@@ -100,7 +128,7 @@ def test_imu_gives_rates_in_the_frame_of_the_base(flat):
     flat.reset(seed=0)
     place(flat, 6, 0, 0.5, yaw=np.pi / 2)
     flat.bullet.resetBaseVelocity(flat.robot, (0, 0, 0), (1.0, 2.0, 3.0))
-    rates = flat._observe()[N_SCAN + 2 : N_SCAN + 5]
+    rates = flat._observe()[N_RAYS + 2 : N_RAYS + 5]
     np.testing.assert_allclose(rates, [2.0, -1.0, 3.0], atol=1e-5)
 
 
@@ -241,11 +269,13 @@ def test_lidar_still_sees_a_thin_wall_that_it_touches(side):
         assert touched > 2
 
 
-def test_the_scan_is_taken_every_other_step(flat):
-    flat.reset(seed=0)
-    scans = [flat.step(np.zeros(17))[0][:N_SCAN] for _ in range(8)]
-    changed = [bool((a != b).any()) for a, b in zip(scans, scans[1:], strict=False)]
-    assert changed == [True, False] * 3 + [True]
+def test_the_scan_and_the_map_are_taken_every_other_step(flat):
+    env = Map(flat)
+    env.reset(seed=0)
+    scans = [env.step(np.zeros(17))[0][: N_RAYS + N_MAP] for _ in range(8)]
+    for part in (slice(N_RAYS), slice(N_RAYS, None)):
+        changed = [bool((a[part] != b[part]).any()) for a, b in zip(scans, scans[1:], strict=False)]
+        assert changed == [True, False] * 3 + [True]
 
 
 def test_ways_are_weighed_as_defined():
@@ -265,35 +295,36 @@ def test_ways_are_weighed_as_defined():
 
 
 def test_ways_are_told_less_the_cheapest(flat):
-    observation, _ = flat.reset(seed=0)
-    told = observation[N_RAYS + N_CHART : N_SCAN]
-    whole = flat.whole
+    env = Map(flat)
+    told = env.reset(seed=0)[0][N_RAYS + N_CHART : N_RAYS + N_MAP]
+    whole = env.whole
     np.testing.assert_allclose(np.expm1(told * math.log(226)), whole - whole.min(), atol=1e-4)
     assert told.min() == 0 and told.max() > 0.1
 
 
 def test_chart_shows_the_wall_that_the_lidar_has_seen_and_the_way_around_it():
     """By hand: a metre in the open counts as one, and 50 times that in the wall's front."""
-    with closing(LocoEnv(wall_ahead)) as env:
+    with closing(Map(LocoEnv(wall_ahead))) as env:
+        def effort():
+            observation = env._look(env.robot._observe())
+            return np.expm1(observation[N_RAYS : N_RAYS + N_CHART].reshape(4, 24) * math.log(226))
+
         env.reset(seed=0)
-        place(env, 4.6, -1.0, 0.3)
-        x, y, _ = env.position
-        env.chart = terrain.Chart(x, y, env.goal)  # as if it had only just come there
-        chart = np.expm1(env._observe()[N_RAYS : N_RAYS + N_CHART].reshape(4, 24) * math.log(226))
+        place(env.robot, 4.6, -1.0, 0.3)
+        x, y, _ = env.robot.position
+        env.chart = terrain.Chart(x, y, env.robot.goal)  # as if it had only just come there
         ahead = np.abs(loco_mtrl.LIDAR_AZIMUTHS[0]) < 15
-        np.testing.assert_allclose(chart[0], 0.6, atol=1e-4)  # 0.6 m on, all around
-        assert chart[2, ahead].min() > 15
-        np.testing.assert_allclose(chart[:, 0], [0.6, 1.5, 2.7, 4.5], atol=1e-4)  # behind
-        place(env, 4.6, -1.0, 0.3, yaw=math.pi)  # it has turned, and knows what is behind it
-        chart = np.expm1(env._observe()[N_RAYS : N_RAYS + N_CHART].reshape(4, 24) * math.log(226))
-        assert chart[2, [0, -1]].min() > 15 and chart[2, ahead].max() < 5
+        np.testing.assert_allclose(effort()[0], 0.6, atol=1e-4)  # 0.6 m on, all around
+        assert effort()[2, ahead].min() > 15
+        np.testing.assert_allclose(effort()[:, 0], [0.6, 1.5, 2.7, 4.5], atol=1e-4)  # behind
+        place(env.robot, 4.6, -1.0, 0.3, yaw=math.pi)  # it has turned, and knows what is behind it
+        assert effort()[2, [0, -1]].min() > 15 and effort()[2, ahead].max() < 5
         env.reset()
         assert np.isnan(env.chart.low).sum() > env.chart.low.size - 300  # a new episode, a new map
 
 
-@pytest.mark.parametrize("paper", [loco_mtrl.OURS, ()])
-def test_reward_is_velocity_toward_the_goal_and_sums_to_the_progress(paper):
-    env = LocoEnv("rugged", difficulty=0.35, paper=paper)
+def test_reward_is_velocity_toward_the_goal_and_sums_to_the_progress():
+    env = LocoEnv("rugged", difficulty=0.35)
     env.reset(seed=1)
 
     first, total = env.distance, 0.0
@@ -311,7 +342,7 @@ def test_reward_is_velocity_toward_the_goal_and_sums_to_the_progress(paper):
 
 def test_the_guide_leads_around_a_wall():
     """Straight on would end at the wall; the legs of the guide's gait alone reach the goal."""
-    with closing(Guide(LocoEnv(wall_ahead))) as env:
+    with closing(Guide(Map(LocoEnv(wall_ahead)))) as env:
         _, info = env.reset(seed=0, options={"route": 0})
         goal, terminated = env.unwrapped.terrain.goals[0], False
         assert (env.unwrapped.position[0] < 6) != (goal[0] < 6)  # the wall is between them
@@ -344,19 +375,20 @@ def test_who_learns_from_the_guide(arguments, shares):
 @pytest.mark.parametrize(("yaw", "turns"), [(0.0, 0), (1.2, -1), (-1.2, 1), (2.8, -1)])
 def test_the_guide_turns_to_the_goal(yaw, turns):
     """On open ground, the goal ahead, to the right, to the left, behind on the right."""
-    with closing(Guide(LocoEnv("flat"))) as env:
+    with closing(Guide(Map(LocoEnv("flat")))) as env:
         env.reset(seed=0)
         x, y, _ = np.subtract(env.unwrapped.position, env.unwrapped.origin)
         goal = env.unwrapped.terrain.goals[env.unwrapped.route]
         place(env.unwrapped, x, y, 0.35, yaw=math.atan2(goal[1] - y, goal[0] - x) + yaw)
-        *_, info = env.step(np.zeros(17))
+        for _ in range(loco_mtrl.LIDAR_EVERY):  # until he has looked
+            *_, info = env.step(np.zeros(17))
         left, right = 0.13 + 0.27 * info["guide"][1:3]  # m
         assert right - left == pytest.approx(0.24 * turns, abs=0.05)
         assert (left + right) / 2 == pytest.approx(0.21 * max(0, math.cos(yaw)) ** 2, abs=0.05)
 
 
 def test_without_a_map_the_guide_heads_for_the_goal():
-    with closing(Guide(LocoEnv("flat", paper=loco_mtrl.OURS))) as env:
+    with closing(Guide(LocoEnv("flat"))) as env:
         _, info = env.reset(seed=0)
         x, y, _ = np.subtract(env.unwrapped.goal, env.unwrapped.position)
         turn = math.remainder(math.atan2(y, x) - env.unwrapped.yaw, 2 * math.pi)
@@ -373,13 +405,13 @@ def test_the_guide_walks_out_of_a_dead_end():
 
     ground = terrain.make_terrain(pocket, np.random.default_rng(0), 1.0)
     ground.starts[0], ground.goals[0] = (7.0, 0, 0, 0), (10.0, 0, 0)
-    with closing(LocoEnv(ground)) as env:
+    with closing(Map(LocoEnv(ground))) as env:
         env.reset(seed=0, options={"route": 0})
-        x = []
-        while env.time < 40 and env.distance > 0.5:
-            x.append(env.position[0] - env.origin[0])
+        robot, x = env.robot, []
+        while robot.time < 40 and robot.distance > 0.5:
+            x.append(robot.position[0] - robot.origin[0])
             env.step(np.nan_to_num(loco_mtrl.advise(env)))
-        assert env.distance < 0.5 and min(x) < 5.0 < max(x)
+        assert robot.distance < 0.5 and min(x) < 5.0 < max(x)
 
 
 @pytest.mark.parametrize(("roll", "crouch"), [(0.0, 0), (0.2, -0.5), (-0.2, -0.5), (0.5, -0.95)])
@@ -392,13 +424,14 @@ def test_the_guide_crouches_on_slopes(plane, roll, crouch):
 
 @pytest.mark.parametrize("steps", [0, 1])  # the second time the LiDAR turns
 def test_the_guide_is_silent_when_the_simulation_breaks_down(steps):
-    with closing(Guide(LocoEnv("flat"))) as env:
+    with closing(Guide(Map(LocoEnv("flat")))) as env:
         env.reset(seed=0)
         for _ in range(steps):
             env.step(np.zeros(17))
         env.unwrapped.bullet.resetBaseVelocity(env.unwrapped.robot, (0, 0, 0), (np.nan, 0, 0))
-        _, _, terminated, _, info = env.step(np.zeros(17))
+        observation, _, terminated, _, info = env.step(np.zeros(17))
         assert terminated and info["exploded"] and np.isnan(info["guide"]).all()
+        assert observation.shape == (402,) and not observation.any()
 
 
 def test_zero_action_walks_by_itself(plane):
@@ -543,9 +576,9 @@ def test_any_finite_action_gives_an_observation_in_the_space(flat, action):
 
 
 def test_mirror_is_its_own_inverse_and_fits_the_spaces():
-    for options in OPTIONS:
-        env = LocoEnv("flat", **options)
-        i, s, j, t = env.mirror()
+    for options in ({}, {"tg": False}, {"lidar": False}, {"paper": ["map"], "guide": True}):
+        env = make_env("flat", **options)
+        i, s, j, t = mirror(env)
         observation = np.arange(env.observation_space.shape[0], dtype=float)
         action = np.arange(env.action_space.shape[0], dtype=float)
         np.testing.assert_array_equal((observation[i] * s)[i] * s, observation)
@@ -555,14 +588,15 @@ def test_mirror_is_its_own_inverse_and_fits_the_spaces():
 
 def test_mirror_is_what_a_mirrored_robot_would_observe(flat):
     """Everything reflected in the x-z plane: pose, goal, legs, stride."""
-    flat.reset(seed=0)
-    i, s, j, t = flat.mirror()
+    env = Map(flat)
+    env.reset(seed=0)
+    i, s, j, t = mirror(env)
     action = np.random.default_rng(1).uniform(-1, 1, 17)
     observations = []
     for side, act in ((1, action), (-1, action[j] * t)):
         flat.generator.reset(0.7 + (np.pi if side < 0 else 0.0))
         flat.goal = flat.origin + [9.0, 1.5 * side, 0.45]
-        flat.chart = terrain.Chart(flat.origin[0] + 6.0, 0.0, flat.goal)  # nothing seen yet
+        env.chart = terrain.Chart(flat.origin[0] + 6.0, 0.0, flat.goal)  # nothing seen yet
         flat.target = flat.generator.step(act[:5], 0.01)
         joints = np.random.default_rng(2).uniform(-0.5, 0.5, 12).reshape(4, 3)
         joints = (joints if side > 0 else joints[[1, 0, 3, 2]]).ravel()
@@ -570,7 +604,7 @@ def test_mirror_is_what_a_mirrored_robot_would_observe(flat):
             flat.bullet.resetJointState(flat.robot, joint, angle)
         place(flat, 6.0, 0.2 * side, 0.6, yaw=0.4 * side, roll=0.1 * side)
         flat.bullet.resetBaseVelocity(flat.robot, (0, 0, 0), (0.3 * side, 0.5, 0.7 * side))
-        observations.append(flat._observe())
+        observations.append(env._look(flat._observe()))
     # The TG's targets mirror to a few hundredths: right and left legs are not built quite alike.
     np.testing.assert_allclose(observations[0][i] * s, observations[1], atol=0.02)
 
@@ -587,8 +621,6 @@ def test_mirror_is_what_a_mirrored_robot_would_observe(flat):
         ({"difficulty": "hard"}, "hard"),
         ({"terrains": 0}, "0"),
         ({"terrains": 1.5}, "1.5"),
-        ({"paper": True}, "True"),
-        ({"paper": ["map", "wings"]}, "wings"),
         ({"render_mode": "ascii"}, "ascii"),
     ],
 )

@@ -265,7 +265,7 @@ def test_two_trainings_of_fifty_updates_are_equal(tmp_path):
 
 
 def test_memory_stays_flat_over_twenty_thousand_episodes():
-    env = loco_mtrl.LocoEnv(["flat", "stairs"])
+    env = loco_mtrl.Map(loco_mtrl.LocoEnv(["flat", "stairs"]))
     rng, process, sizes = np.random.default_rng(0), psutil.Process(), []
     env.reset(seed=0)
     actions = rng.normal(0, 0.3, (100, *env.action_space.shape))
