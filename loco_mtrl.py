@@ -501,8 +501,9 @@ if "LocoMTRL-v0" not in gymnasium.registry:  # run as a script, this file is imp
 
 # What the paper has not: a guide in training (`Guide`), and a map among what the robot observes.
 OURS = ("guide", "map")
-CHART_RADII, CHART_EVERY = (0.6, 1.5, 2.7, 4.5), 10
-_LINES = np.radians(LIDAR_AZIMUTHS[0])
+CHART_RADII = 0.6, 1.5, 2.7, 4.5  # m: how far along a way its effort is observed
+CHART_EVERY = 10  # control steps from one drawing of the map to the next
+_LINES = np.radians(LIDAR_AZIMUTHS[0])  # the ways: one along each of the scan's columns
 _PACES = np.arange(0.3, 4.6, 0.3)  # m, the places on a line
 _PLACES, _TURN = _PACES[:, None] * np.exp(1j * _LINES), 0.3 * np.abs(_LINES) / np.pi
 _CHARTED = np.isin(np.round(_PACES, 1), CHART_RADII)
