@@ -159,7 +159,7 @@ MAX_TORQUE = 40.0  # Nm
 POSITION_GAIN, VELOCITY_GAIN = 0.10, 1.0
 # Share of a new action that takes effect at once, for the generator's parameters and the joints:
 # more would be jitter, less could not react.
-SMOOTHING = np.array([0.2] * TrajectoryGenerator.action_size + [0.5] * 12)
+SMOOTHING = [0.2] * TrajectoryGenerator.action_size + [0.5] * 12
 RESIDUAL = {True: 0.1, False: 0.6}  # rad, largest u_fb with the TG, and without
 GOAL_RADIUS = 0.5  # m, r_g
 BASE_HEIGHT = 0.30  # m, of the walking base: a goal floats that high over the ground
@@ -260,7 +260,7 @@ class LocoEnv(gymnasium.Env):
         self.observation_space = gymnasium.spaces.Box(*np.float32([low, high]))
         n_act = 12 + TrajectoryGenerator.action_size * tg
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (n_act,))
-        self.smoothing = SMOOTHING[-n_act:]
+        self.smoothing, self.residual = SMOOTHING[-n_act:], RESIDUAL[tg]
         self.spent = np.zeros(len(self.pool))  # seconds in each terrain, those of failures cheap
         self.time = 0.0
 
@@ -362,11 +362,11 @@ class LocoEnv(gymnasium.Env):
         self.goal = (terrain.goals[route] + self.origin + [0, 0, BASE_HEIGHT]).tolist()
         yaw += rng.uniform(-0.5, 0.5)
 
-        self.target = STANDING
+        self.target = STANDING.tolist()
         if self.generator:
             self.generator.reset(rng.uniform(0, 2 * np.pi))
-            self.target = self.generator.step(np.zeros(self.generator.action_size), 0.0)
-        self.action = np.zeros(self.action_space.shape)
+            self.target = self.generator.step([0.0] * self.generator.action_size, 0.0).tolist()
+        self.action = [0.0] * len(self.smoothing)
         position = self.origin + [x, y, z + BASE_HEIGHT + 0.02]
         p.resetBasePositionAndOrientation(self.robot, position, _about_z(yaw))
         p.resetBaseVelocity(self.robot, [0, 0, 0], [0, 0, 0])
@@ -389,17 +389,16 @@ class LocoEnv(gymnasium.Env):
     def step(self, action):
         p = self.bullet
         action = np.asarray(action, dtype=np.float64)
-        if action.shape != self.action.shape or not math.isfinite(action.sum()):
-            raise ValueError(f"action must be {self.action.size} finite numbers, got {action}")
-        self.action += self.smoothing * (np.minimum(np.maximum(action, -1.0), 1.0) - self.action)
-        if self.generator:
-            n = self.generator.action_size
-            u_fb = RESIDUAL[True] * self.action[n:]
-            self.target = self.generator.step(self.action[:n], DT) + u_fb
-        else:
-            self.target = STANDING + RESIDUAL[False] * self.action
+        if action.shape != self.action_space.shape or not math.isfinite(sum(action.tolist())):
+            raise ValueError(f"action must be {len(self.action)} finite numbers, got {action}")
+        # Plain floats: NumPy is slow on so few numbers.
+        pairs = zip(self.action, action.tolist(), self.smoothing, strict=True)
+        self.action = [old + k * (min(max(new, -1.0), 1.0) - old) for old, new, k in pairs]
+        u_tg = self.generator.step(self.action[:-12], DT) if self.generator else STANDING
+        pairs = zip(u_tg.tolist(), self.action[-12:], strict=True)
+        self.target = [u + self.residual * a for u, a in pairs]  # u_tg + u_fb
         p.setJointMotorControlArray(self.robot, self.joints, p.POSITION_CONTROL,
-                                    self.target.tolist(), **self._gains)
+                                    self.target, **self._gains)
         p.stepSimulation()
         self.time += DT
         if self.people:
@@ -448,10 +447,10 @@ class LocoEnv(gymnasium.Env):
         wx, wy, wz = self.rates
         state += [r[i] * wx + r[3 + i] * wy + r[6 + i] * wz for i in range(3)]
         state += [joint[0] for joint in p.getJointStates(self.robot, self.joints)]
-        state += self.target.tolist()
+        state += self.target
         if self.generator:
             state += self.generator.state()
-        observation = np.empty(self.observation_space.shape, dtype=np.float32)
+        observation = np.empty(self.scan.size + len(state), np.float32)
         observation[self.scan.size :] = state
         if turn_lidar and self.lidar and math.isfinite(self.distance):
             self.hits = p.rayTestBatch(*self._rays, parentObjectUniqueId=self.robot,
@@ -596,7 +595,7 @@ def advise(env):
     all but two strides and the stance height.
     """
     robot = env.unwrapped
-    advice = np.full(robot.action.shape, np.nan)
+    advice = np.full(robot.action_space.shape, np.nan)
     if robot.exploded:
         return advice
     (x, y, _), (to_x, to_y, _) = robot.position, robot.goal

@@ -137,7 +137,7 @@ def show(name, value):
 
 
 def main():
-    for label, wrap in (("LocoEnv", lambda env: env), ("with a Map around", loco_mtrl.Map)):
+    for label, wrap in (("with a Map around", loco_mtrl.Map), ("LocoEnv", lambda env: env)):
         spent, env = {}, wrap(LocoEnv("rugged", difficulty=0.5))
         step, reset = walk(env, STEPS)
         measured, _ = walk(env, STEPS, spent)
@@ -147,9 +147,9 @@ def main():
         for name, seconds in spent.items():
             show(f"  ms a step in {name}", f"{sum(seconds) / STEPS * 1e3:.3f}")
         show("  share inside those two", f"{inside / measured:.2f}")
+        show("  reset", f"{reset * 1e3:.1f} ms")
     naive, _ = walk(NaiveEnv("rugged", difficulty=0.5), 200)
     show("one box per pillar and the URDF's meshes: slower by", f"{naive / step:.0f}x")
-    show("reset", f"{reset * 1e3:.1f} ms")
     size, growth = memory()
     show("memory of one rank, all tasks", f"{size:.0f} MB")
     show("  growth over resets 500 to 5,000", f"{growth:.1f} MB")

@@ -597,7 +597,7 @@ def test_mirror_is_what_a_mirrored_robot_would_observe(flat):
         flat.generator.reset(0.7 + (np.pi if side < 0 else 0.0))
         flat.goal = flat.origin + [9.0, 1.5 * side, 0.45]
         env.chart = terrain.Chart(flat.origin[0] + 6.0, 0.0, flat.goal)  # nothing seen yet
-        flat.target = flat.generator.step(act[:5], 0.01)
+        flat.target = flat.generator.step(act[:5], 0.01).tolist()
         joints = np.random.default_rng(2).uniform(-0.5, 0.5, 12).reshape(4, 3)
         joints = (joints if side > 0 else joints[[1, 0, 3, 2]]).ravel()
         for joint, angle in zip(flat.joints, joints, strict=True):
