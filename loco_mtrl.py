@@ -535,11 +535,14 @@ class Map(gymnasium.Wrapper):
     is drawn anew every CHART_EVERY control steps.
 
     observed: False: the map is drawn, for a guide, but the observation remains LocoEnv's.
+    Raises ValueError if the robot is blind.
     """
 
     def __init__(self, env, observed=True):
         super().__init__(env)
         self.robot, self.observed = env.unwrapped, observed
+        if not self.robot.lidar:
+            raise ValueError("a Map needs what the LiDAR sees: lidar must be True, got False")
         (rows, columns), space = self.robot.scan_shape, env.observation_space
         self.n_scan, n_map = rows * columns, (len(CHART_RADII) + 1) * columns * observed
         self.scan_shape = rows + n_map // columns, columns

@@ -629,6 +629,12 @@ def test_bad_arguments_are_named(options, named):
         LocoEnv(**options)
 
 
+def test_a_blind_robot_draws_no_map():
+    with closing(LocoEnv("flat", lidar=False)) as env:
+        with pytest.raises(ValueError, match="lidar"):
+            Map(env)
+
+
 @pytest.mark.parametrize("options", [{"terrain": 1}, {"terrain": -1}, {"terrain": "flat"},
                                      {"route": 8}, {"route": 0.5}, {"route": np.nan},
                                      {"seed": 3}])  # fmt: skip
