@@ -1037,7 +1037,8 @@ def play(args):
     end = "reached the goal" if info["success"] else "fell" if info["fall"] else "ran out of time"
     print(f"{terrain.name}: t_cr {info['t_cr']:.2f}, {end} after {len(path) * DT:.1f} s")
     if not args.gui:
-        palette = Image.fromarray(np.concatenate(frames[:: len(frames) // 8 + 1])).quantize(64)
+        some = frames[:: -(len(frames) // 8 + 1)]  # the last one among them: it shows the goal
+        palette = Image.fromarray(np.concatenate(some)).quantize(64)
         pictures = [Image.fromarray(frame).quantize(palette=palette, dither=0) for frame in frames]
         pictures[0].save(args.gif, save_all=True, append_images=pictures[1:], loop=0,
                          duration=round(1000 * GIF_EVERY * DT))
