@@ -632,9 +632,10 @@ class Guide(gymnasium.Wrapper):
 
 
 def make_env(tasks, lidar=True, paper=(), guide=False, **options):
-    """A robot as in training and scoring: LocoMTRL-v0, in a `Map` and with a `Guide`.
+    """A robot as in training and scoring: LocoMTRL-v0 in a `Map`, in training with a `Guide`.
 
-    paper: which of OURS it does without; a blind one has no map. options: LocoEnv's.
+    paper: with "map" among them it does not observe one, and a blind robot has none.
+    options: LocoEnv's.
     """
     env = gymnasium.make("LocoMTRL-v0", tasks=tasks, lidar=lidar, disable_env_checker=True,
                          **options)

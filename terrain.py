@@ -730,6 +730,7 @@ def waves(rng, difficulty):
 for _task in (obstacles, poles, corridors, walls, rooms, mazes, screens, traps):
     _task.fence = True  # walls all around: who looks for a way must not fall off the world
 
+# Ranks take them in turns: in this order every other one makes half of the work.
 PILLAR_TASKS = {task.__name__: task for task in (
     flat, rugged, holes, obstacles, poles, stairs, stones, hills, slopes, pyramids_up,
     pyramids_down, gaps, hurdles, ridges, pits, coasts, walls, corridors, rooms, mazes,
