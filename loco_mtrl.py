@@ -6,13 +6,13 @@ Diverse Environments"; the sections named below are the paper's.
 """
 
 import argparse
-import cmath
+import concurrent.futures
 import contextlib
+import functools
+import itertools
 import json
-import logging
 import math
 import multiprocessing
-import operator
 import os
 import shlex
 import signal
@@ -21,32 +21,30 @@ import sys
 import tempfile
 import time
 import xml.etree.ElementTree as ET
-from functools import partial
 from numbers import Real
 from pathlib import Path
+from typing import NamedTuple
 
 import gymnasium
 import numpy as np
 import torch
 from tqdm import tqdm
 
-from ppo import PPOConfig, learn, load_checkpoint, load_policy, write_whole
+from ppo import Interrupt, PPOConfig, learn, load_policy, save_policy
 from terrain import (
-    PERSON_HEIGHT,
-    PERSON_RADIUS,
     PILLAR_TASKS,
     WORLDS,
-    Chart,
+    Person,
     Terrain,
-    load_mesh,
+    load_scan,
     make_terrain,
     make_world,
 )
-from tg import CENTRE, LEGS, RANGE, STANDING, TrajectoryGenerator
+from tg import LEGS, STANDING, TrajectoryGenerator
 
 
 @contextlib.contextmanager
-def _quiet():
+def quiet():
     """PyBullet prints banners from C; they have no place in progress bars and JSON."""
     sys.stdout.flush()
     saved, sink = [os.dup(1), os.dup(2)], os.open(os.devnull, os.O_WRONLY)
@@ -59,89 +57,33 @@ def _quiet():
             os.close(file)
 
 
-with _quiet():
+with quiet():
     import pybullet
     import pybullet_data
     from pybullet_utils.bullet_client import BulletClient
 
-# ------------------------------------------------------------------------------- the robot
-
-LAIKAGO = Path(pybullet_data.getDataPath()) / "laikago" / "laikago_toes_zup.urdf"
-JOINTS = ("hip_motor_2_chassis_joint", "upper_leg_2_hip_motor_joint", "lower_leg_2_upper_leg_joint")
-
-
-def robot_urdf(visual):
-    """The Laikago's URDF as text, made cheap to simulate.
-
-    Collision shapes become primitives: Bullet would spend most of a step between the original
-    convex hulls and the terrain's triangles. Pictures are kept only if `visual`; they cost 0.3 s
-    and 170 MB a robot.
-    """
-    tree = ET.parse(LAIKAGO)
-    for mesh in tree.iter("mesh"):
-        mesh.set("filename", str(LAIKAGO.parent / mesh.get("filename")))
-    for link in tree.iter("link"):
-        name, collision = link.get("name"), link.find("collision")
-        for part in link.findall("visual"):
-            if not visual:
-                link.remove(part)
-        for contact in link.findall("contact"):
-            contact.clear()  # drops spinning friction and the toes' friction anchors
-            ET.SubElement(contact, "lateral_friction", value="1")
-        if name == "chassis":
-            _replace(collision, (-0.0125, 0, -0.016), (0, 0, 1), "box", size="0.577 0.28 0.188")
-            for lens in (LIDAR_FRONT, LIDAR_REAR):
-                housing = ET.SubElement(link, "collision")
-                _replace(housing, lens, (0, 0, 1), "sphere", radius=str(HOUSING))
-        elif name.endswith("hip_motor"):
-            link.remove(collision)  # inside the chassis box, but for a centimetre
-        elif name.endswith("upper_leg"):
-            _capsule(collision, (0, -0.20833, -0.1422), 0.03)
-        elif name.endswith("lower_leg"):
-            _capsule(collision, (0, -0.225, -0.0198), 0.015)  # ends inside the toe's sphere
-    return ET.tostring(tree.getroot(), encoding="unicode")
-
-
-def _replace(collision, centre, axis, shape, **size):
-    """A primitive at `centre` whose own z axis points along `axis`."""
-    pitch = math.atan2(math.hypot(axis[0], axis[1]), axis[2])
-    rpy = f"0 {pitch} {math.atan2(axis[1], axis[0])}"
-    collision.clear()
-    ET.SubElement(collision, "origin", xyz="{} {} {}".format(*centre), rpy=rpy)
-    ET.SubElement(ET.SubElement(collision, "geometry"), shape, **size)
-
-
-def _capsule(collision, end, radius):
-    """A capsule from the link's joint to `end`."""
-    size = {"radius": str(radius), "length": str(math.hypot(*end))}
-    _replace(collision, [c / 2 for c in end], end, "capsule", **size)
-
-
-# ------------------------------------------------------------------------------- the senses
+# ------------------------------------------------------------------------------- the LiDAR
 
 LIDAR_RANGE = 5.0  # m
-LIDAR_EVERY = 2  # control steps from one scan to the next: it turns at 15 Hz, as real ones do
 LIDAR_FRONT, LIDAR_REAR = (0.36, 0.0, 0.08), (-0.38, 0.0, 0.08)  # m, of the two sensors
-HOUSING = 0.04  # m, radius of the ball around each: without it, a lens would enter whatever thin
-# thing the robot runs into, and see nothing of it any more
+HOUSING = 0.04  # m, radius of the ball around each: it keeps the lens out of thin walls
 # Degrees. Steep rays see the ground that the front feet are about to meet, level ones see walls.
-LIDAR_ELEVATIONS = (-84, -70, -57, -45, -34, -25, -17, -10, -3, 8)
+LIDAR_ELEVATIONS = (-70, -52, -38, -27, -18, -10, -3, 8)
 # The columns on the left, from ahead to behind, densest ahead, then the first of the right side.
 # Each row is turned outwards by 0, 1 or 2 thirds of the way to the next column: together, three
 # rows see poles that would slip through one.
-_COLUMNS = (4, 12, 21, 31, 42, 54, 68, 84, 105, 130, 155, 175, 185)
-_LEFT = [np.interp(np.arange(12) + row % 3 / 3, np.arange(13), _COLUMNS)
+_COLUMNS = (4, 13, 23, 34, 46, 60, 78, 102, 130, 158, 186)
+_LEFT = [np.interp(np.arange(10) + row % 3 / 3, np.arange(11), _COLUMNS)
          for row in range(len(LIDAR_ELEVATIONS))]
 LIDAR_AZIMUTHS = np.array([[*left[::-1], *-left] for left in _LEFT])  # degrees, (rows, columns)
-N_RAYS = LIDAR_AZIMUTHS.size
-HIT_FRACTION = operator.itemgetter(2)  # of the range, in what rayTestBatch gives for a ray
+SCAN_SHAPE, N_RAYS = LIDAR_AZIMUTHS.shape, LIDAR_AZIMUTHS.size
 
 
 def lidar_rays():
     """Where the rays start (m) and their unit vectors, (N_RAYS, 3) each in the base frame.
 
     Row by row from the lowest, left to right. They start ahead of the chassis or, those that look
-    back, behind it: nearer by 5 cm they would cost a quarter more, for many would cross a leg.
+    back, behind it: a ray that crosses the robot's own hulls costs many times one that does not.
     """
     up, left = np.radians(LIDAR_ELEVATIONS)[:, None], np.radians(LIDAR_AZIMUTHS)
     up, left = (angle.ravel() for angle in np.broadcast_arrays(up, left))
@@ -149,30 +91,52 @@ def lidar_rays():
     return np.where(directions[:, :1] > 0, LIDAR_FRONT, LIDAR_REAR), directions
 
 
-# ------------------------------------------------------------------------------- the environment
+# ------------------------------------------------------------------------------- the simulation
 
+LAIKAGO = Path(pybullet_data.getDataPath()) / "laikago" / "laikago_toes_zup.urdf"
+JOINTS = ("hip_motor_2_chassis_joint", "upper_leg_2_hip_motor_joint", "lower_leg_2_upper_leg_joint")
 SUBSTEPS, DT = 5, 1 / 30  # physics steps in a control step, and its length in s
-GRAVITY = 9.81  # m/s2
 MAX_TORQUE = 40.0  # Nm
-# Bullet's implicit PD, per physics step. Compliant on purpose: of 1,500 random gaits on rugged
-# ground those with a position gain of 0.25 stayed up a third as long.
-POSITION_GAIN, VELOCITY_GAIN = 0.10, 1.0
-# Share of a new action that takes effect at once, for the generator's parameters and the joints:
-# more would be jitter, less could not react.
-SMOOTHING = [0.2] * TrajectoryGenerator.action_size + [0.5] * 12
-RESIDUAL = {True: 0.1, False: 0.6}  # rad, largest u_fb with the TG, and without
-GOAL_RADIUS = 0.5  # m, r_g
-BASE_HEIGHT = 0.30  # m, of the walking base: a goal floats that high over the ground
-EXPLODED = 1e3  # m or rad/s
-# A person who meets more resistance steps back. A body that is moved regardless pushes with any
-# force: with 70 kN people have pressed the robot through walls.
-PUSH = 200.0  # N
-FALL_UP, FALL_SPEED = 0.5, 2.5  # fallen: tipped by over 60 degrees, or dropping faster (m/s)
-MAX_EPISODE_STEPS = 900  # 30 s
-PICTURE = (400, 300)  # pixels
-HOT = ("setJointMotorControlArray", "stepSimulation", "getBasePositionAndOrientation",
-       "getBaseVelocity", "getMatrixFromQuaternion", "getJointStates", "rayTestBatch")
+# Bullet's implicit PD, per physics step. Compliant on purpose: stiff legs fall more often.
+POSITION_GAIN, VELOCITY_GAIN, SOLVER_ITERATIONS = 0.10, 1.0, 10
 STATIC_GROUP = 2  # Bullet's collision group of all that does not move by itself: rays see only it
+PICTURE = 400, 300  # pixels, width and height of a rendered frame
+
+
+# Collision shapes in place of the convex hulls, with which most of a step would be spent on hull
+# against triangle: link, centre (m), roll (rad), kind, size (m). The two lenses are of the LiDAR.
+SHAPES = [
+    ("chassis", (-0.0125, 0, -0.016), 0, "box", {"size": "0.577 0.28 0.188"}),
+    ("chassis", LIDAR_FRONT, 0, "sphere", {"radius": str(HOUSING)}),
+    ("chassis", LIDAR_REAR, 0, "sphere", {"radius": str(HOUSING)}),
+    ("upper_leg", (0, -0.104165, -0.0711), 2.16983, "capsule",
+     {"radius": "0.03", "length": "0.25224"}),
+    ("lower_leg", (0, -0.1125, -0.0099), 1.65857, "capsule",
+     {"radius": "0.015", "length": "0.22587"}),  # ends inside the toe's sphere
+]
+
+
+def robot_urdf(visual):
+    """The Laikago's URDF as text, with SHAPES. Pictures, 0.3 s and 170 MB, only if `visual`."""
+    tree = ET.parse(LAIKAGO)
+    for mesh in tree.iter("mesh"):
+        mesh.set("filename", str(LAIKAGO.parent / mesh.get("filename")))
+    for link in tree.iter("link"):
+        for part in link.findall("visual") if not visual else ():
+            link.remove(part)
+        for contact in link.findall("contact"):
+            contact.clear()  # drops spinning friction and the toes' friction anchors
+            ET.SubElement(contact, "lateral_friction", value="1")
+        if "toe" not in link.get("name"):  # hip motors lie inside the chassis: they need no shape
+            for part in link.findall("collision"):
+                link.remove(part)
+        for name, centre, roll, kind, size in SHAPES:
+            if link.get("name").endswith(name):
+                collision = ET.SubElement(link, "collision")
+                xyz = " ".join(map(str, centre))
+                ET.SubElement(collision, "origin", xyz=xyz, rpy=f"{roll} 0 0")
+                ET.SubElement(ET.SubElement(collision, "geometry"), kind, **size)
+    return ET.tostring(tree.getroot(), encoding="unicode")
 
 
 def _about_z(yaw):
@@ -180,25 +144,227 @@ def _about_z(yaw):
     return 0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2)
 
 
+class Robot(NamedTuple):
+    """The robot at one moment, in the world's frame but for its rates."""
+
+    position: tuple  # (x, y, z) m
+    yaw: float  # rad
+    up: float  # z of the base's own z axis: 1 upright, 0 on its side
+    sink: float  # m/s, downward speed
+    rates: list  # 3 angular rates in the frame of the base, rad/s
+    joints: list  # 12 angles, rad
+
+
+class Simulation:
+    """PyBullet with one Laikago, a pool of terrains side by side, and people.
+
+    Bullet never frees a mesh, so the pool is built once, and a reset only moves the robot.
+    `origins` says where each terrain's own frame begins, (x, y, z) m.
+    """
+
+    def __init__(self, pool, visual, gui):
+        self.visual = visual or gui
+        with quiet():
+            mode = pybullet.GUI if gui else pybullet.DIRECT
+            self.bullet = p = BulletClient(connection_mode=mode)
+            p.configureDebugVisualizer(p.COV_ENABLE_GUI, 0)
+        p.setGravity(0, 0, -9.81)
+        p.setPhysicsEngineParameter(
+            fixedTimeStep=DT, numSubSteps=SUBSTEPS, numSolverIterations=SOLVER_ITERATIONS,
+            enableConeFriction=0, deterministicOverlappingPairs=1)
+        self.origins, edge = [], 0.0
+        for terrain in pool:  # farther apart than the LiDAR reaches
+            low, high = terrain.vertices[:, 0].min(), terrain.vertices[:, 0].max()
+            self.origins.append((edge - low, 0.0, 0.0))
+            edge += high - low + 2 * LIDAR_RANGE
+            self._add_terrain(terrain, self.origins[-1])
+        self.load_robot()
+        self.people = [self._add_body(p.GEOM_CYLINDER, (0.9, 0.5, 0.2, 1), Person.RADIUS,
+                                      Person.HEIGHT)
+                       for _ in range(max(len(terrain.people) for terrain in pool))]
+        self.flag = self._add_body(p.GEOM_SPHERE, (0.2, 0.8, 0.3, 1), 0.2)
+        sources, directions = lidar_rays()
+        self._rays = sources.tolist(), (sources + LIDAR_RANGE * directions).tolist()
+        self._gains = dict(positionGains=[POSITION_GAIN] * 12, velocityGains=[VELOCITY_GAIN] * 12,
+                           forces=[MAX_TORQUE] * 12)
+
+    def __reduce__(self):
+        raise TypeError("a simulation cannot be copied or pickled: make another environment")
+
+    def load_robot(self):
+        """Loads a robot; a broken one before it is to be removed."""
+        p = self.bullet
+        with tempfile.NamedTemporaryFile("w", suffix=".urdf") as file:
+            file.write(robot_urdf(self.visual))
+            file.flush()
+            self.robot = p.loadURDF(file.name, [0, 0, 1000])
+        joints = [p.getJointInfo(self.robot, j) for j in range(p.getNumJoints(self.robot))]
+        ids = {joint[1].decode(): joint[0] for joint in joints}
+        self.joints = [ids[f"{leg}_{joint}"] for leg in LEGS for joint in JOINTS]
+
+    def _add_terrain(self, terrain, origin):
+        p = self.bullet
+        mesh = dict(vertices=terrain.vertices.tolist(), indices=terrain.triangles.ravel().tolist())
+        shape = p.createCollisionShape(p.GEOM_MESH, flags=p.GEOM_FORCE_CONCAVE_TRIMESH, **mesh)
+        body = p.createMultiBody(0, shape, basePosition=origin)
+        p.changeDynamics(body, -1, lateralFriction=1.0)
+        if not self.visual:
+            return
+        # Ground and walls in colours of their own: shading alone does not tell them apart.
+        a, b, c = (terrain.vertices[terrain.triangles[:, k]] for k in range(3))
+        normal = np.cross(b - a, c - a)
+        steep = np.abs(normal[:, 2]) < 0.5 * np.linalg.norm(normal, axis=1)
+        for part, colour in ((~steep, (0.75, 0.78, 0.66, 1)), (steep, (0.6, 0.47, 0.4, 1))):
+            if part.any():
+                mesh["indices"] = terrain.triangles[part].ravel().tolist()
+                looks = p.createVisualShape(p.GEOM_MESH, rgbaColor=colour, **mesh)
+                p.createMultiBody(0, -1, looks, basePosition=origin)
+
+    def _add_body(self, kind, colour, radius, height=0.0):
+        """A person or, without a height, a mark that nothing feels; at first far below."""
+        p, shape, looks = self.bullet, -1, -1
+        if height:
+            shape = p.createCollisionShape(kind, radius=radius, height=height)
+        if self.visual:
+            looks = p.createVisualShape(kind, radius=radius, length=height, rgbaColor=colour)
+        return p.createMultiBody(0, shape, looks, basePosition=(0, 0, -1000))
+
+    def place(self, position, yaw, joints):
+        """Puts the robot down, at rest. What happens next depends on nothing that was before."""
+        p = self.bullet
+        for place in ((0, 0, 1000), position):  # far away first: Bullet forgets old contacts
+            p.resetBasePositionAndOrientation(self.robot, place, _about_z(yaw))
+            p.resetBaseVelocity(self.robot, [0, 0, 0], [0, 0, 0])
+            for joint, angle in zip(self.joints, joints, strict=True):
+                p.resetJointState(self.robot, joint, angle)
+            if place is not position:
+                self.step(joints)
+
+    def step(self, targets):
+        """One control step with the PD controllers' targets (12 joint angles, rad)."""
+        p = self.bullet
+        p.setJointMotorControlArray(self.robot, self.joints, p.POSITION_CONTROL, targets,
+                                    **self._gains)
+        p.stepSimulation()
+
+    def sense(self):
+        """The Robot as it is now."""
+        p = self.bullet
+        position, quaternion = p.getBasePositionAndOrientation(self.robot)
+        velocity, (wx, wy, wz) = p.getBaseVelocity(self.robot)
+        r = p.getMatrixFromQuaternion(quaternion)
+        rates = [r[i] * wx + r[3 + i] * wy + r[6 + i] * wz for i in range(3)]
+        joints = [joint[0] for joint in p.getJointStates(self.robot, self.joints)]
+        return Robot(position, math.atan2(r[3], r[0]), r[8], -velocity[2], rates, joints)
+
+    def scan(self):
+        """What rayTestBatch says of each ray: body, link, fraction of the range, position, ..."""
+        return self.bullet.rayTestBatch(*self._rays, parentObjectUniqueId=self.robot,
+                                        parentLinkIndex=-1, collisionFilterMask=STATIC_GROUP)
+
+    def move_people(self, terrain, origin):
+        """Puts the bodies where the terrain's people are; those that it lacks, far below."""
+        for body, person in itertools.zip_longest(self.people, terrain.people):
+            place, yaw = (0, 0, -1000), 0.0
+            if person:
+                x, y, yaw = person.place()
+                place = (x + origin[0], y, float(terrain.height(x, y)) + Person.HEIGHT / 2)
+            self.bullet.resetBasePositionAndOrientation(body, place, _about_z(yaw))
+
+    def touches_people(self):
+        return any(self.bullet.getContactPoints(self.robot, body) for body in self.people)
+
+    def picture(self, position, yaw):
+        """The robot from above and behind, uint8 (300, 400, 3)."""
+        p, (width, height) = self.bullet, PICTURE
+        view = p.computeViewMatrixFromYawPitchRoll(position, 2.4, math.degrees(yaw) - 90, -52, 0, 2)
+        projection = p.computeProjectionMatrixFOV(55, width / height, 0.1, 40)
+        rgba = p.getCameraImage(width, height, view, projection, lightDirection=(2, 3, 8),
+                                renderer=p.ER_TINY_RENDERER)[2]
+        return np.reshape(rgba, (height, width, 4))[..., :3].astype(np.uint8)
+
+
+# ------------------------------------------------------------------------------- the environment
+
+HOLD = 3  # control steps that one decision of the policy lasts: it decides at 10 Hz
+# Share of a new action that takes effect in one control step: TG parameters, joint residuals.
+SMOOTHING = {"tg": 0.2, "joints": 0.5}
+RESIDUAL = {True: 0.04, False: 0.6}  # rad that a joint's action of 1 means, with and without TG
+BASE_HEIGHT = 0.28  # m, of the base above the ground in the standing pose
+GOAL_RADIUS = 0.5  # m, r_g
+FALL_UP = 0.5  # cosine of the greatest tilt: a base tipped by over 60 degrees has fallen
+FALL_SPEED = 2.5  # m/s, downward speed that would break a real robot
+EXPLODED = 1e3  # m or rad/s that no robot reaches: the simulation has broken down
+
+
+class Part(NamedTuple):
+    """Part of an observation or an action; part[image] * sign is its left-right mirror image."""
+
+    name: str
+    size: int
+    low: float
+    high: float
+    image: list
+    sign: list
+    std: float = 0.0  # of an action's exploration noise at first
+
+
+def _part(name, low, high, image, sign=1, std=0.0):
+    image = np.ravel(image).tolist()
+    return Part(name, len(image), low, high, image, (np.ones(len(image)) * sign).tolist(), std)
+
+
+SWAP_LEGS = np.arange(12).reshape(4, 3)[[1, 0, 3, 2]]  # joint angles mirror unsigned
+SWAP_STRIDES = [0, 2, 1, 3, 4]
+
+
+def observation_parts(tg=True, lidar=True):
+    """What an observation consists of, in its order (section 2.1)."""
+    parts = [
+        _part("LiDAR scan, sqrt(distance / 5 m)", 0, 1,
+              np.arange(N_RAYS).reshape(SCAN_SHAPE)[:, ::-1]),
+        _part("distance to the goal, m", 0, 1e3, [0]),
+        _part("heading of the goal, left positive, rad", -math.pi, math.pi, [0], -1),
+        _part("angular rates of the base, rad/s", -1e3, 1e3, [0, 1, 2], [-1, 1, -1]),
+        _part("joint angles, rad", -1e2, 1e2, SWAP_LEGS),
+        _part("last commanded joint angles, rad", -1e2, 1e2, SWAP_LEGS),
+        _part("TG: cosine and sine of each leg's phase", -1, 1, [1, 0, 3, 2, 5, 4, 7, 6]),
+        _part("TG: parameters in force", -1, 1, SWAP_STRIDES),
+    ]
+    return parts[not lidar : len(parts) - 2 * (not tg)]
+
+
+def action_parts(tg=True):
+    """What an action consists of."""
+    if not tg:
+        return [_part("joint offsets from the standing pose", -1, 1, SWAP_LEGS, std=0.25)]
+    return [_part("TG: parameters", -1, 1, SWAP_STRIDES, std=0.3),
+            _part("joint residuals", -1, 1, SWAP_LEGS, std=0.5)]
+
+
+def box(parts):
+    low, high = ([part[k] for part in parts for _ in range(part.size)] for k in (2, 3))
+    return gymnasium.spaces.Box(np.float32(low), np.float32(high))
+
+
+def mirror(parts):
+    """(index, sign) over all parts: the image of an observation or action x is x[index] * sign."""
+    starts = itertools.accumulate((part.size for part in parts), initial=0)
+    index = [start + k for start, part in zip(starts, parts, strict=False) for k in part.image]
+    return index, [sign for part in parts for sign in part.sign]
+
+
 class LocoEnv(gymnasium.Env):
     """A Laikago walks to a goal over terrain that only its LiDAR shows it (section 2).
 
-    ## Observation: Box((282,), float32), in the order of section 2.1
-    | entries | meaning | unit |
-    |---|---|---|
-    | 240 | r, LiDAR scan: sqrt(distance / 5 m), 1: no hit; rows from low to high, left to right | |
-    | 1 | g_d, distance to the goal | m |
-    | 1 | g_h, heading of the goal relative to the robot's, left positive | rad |
-    | 3 | angular rates of the base in its own frame (IMU) | rad/s |
-    | 12 | q, joint angles: FR, FL, RR, RL x abduction, hip, knee | rad |
-    | 12 | a_{t-1}, joint targets commanded in the previous step | rad |
-    | 13 | s_tg, state of the trajectory generator; none with tg=False | |
-    The scan is taken at 15 Hz, all else at 30 Hz; with lidar=False there is none. `Map` adds to it.
+    ## Observation: Box, float32
+    `observation_parts` is the table of its entries, in the order of section 2.1.
 
-    ## Action: Box(-1, 1, (17,), float32), clipped to that range, then smoothed
+    ## Action: Box(-1, 1), clipped to that range
     5 parameters of the trajectory generator (`tg.PARAMETERS`), then the 12 residuals u_fb;
     u_tg + u_fb are joint targets, which PD controllers with limited torque track (section 2.2).
-    With tg=False (reactive), 12 offsets from the standing pose.
+    With tg=False (reactive), 12 offsets from the standing pose. An action is held for HOLD control
+    steps of DT s, in which what is in force moves toward it (SMOOTHING).
 
     ## Reward
     (d_{t-1} - d_t) / dt, the velocity toward the goal, m/s. The paper prints the opposite sign but
@@ -215,565 +381,283 @@ class LocoEnv(gymnasium.Env):
     Args:
         tasks: a task's name, a function (rng, difficulty) -> heights, a finished Terrain, or a list
             of these; None: all pillar tasks. The policy is not told which.
-        difficulty: in [0, 1], or (low, high) to draw it from, once for each terrain.
+        difficulty: (low, high) in [0, 1], to draw it from, once for each terrain.
         tg, lidar: the paper's ablations (section 3) leave one of them out.
-        terrains: how many terrains of each task to build; Bullet never frees a mesh, so the pool
-            is built once. An episode takes the one that has had least time so far, and chance
-            decides between equals. A finished Terrain counts once.
-        pool_seed: seeds the pool; `reset(seed=...)` seeds all else.
+        layouts: how many terrains of each task to build. An episode draws one of them all.
+        pool_seed: seeds the layouts; `reset(seed=...)` seeds all else.
         render_mode: None or "rgb_array".
         gui: open PyBullet's window; it allows one in a process.
 
     Raises ValueError for any argument out of range, naming it and what is valid.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": round(1 / DT)}
+    metadata = {"render_modes": ["rgb_array"], "render_fps": round(1 / DT / HOLD)}
 
-    def __init__(self, tasks=None, difficulty=(0.0, 1.0), tg=True, lidar=True, terrains=1,
+    def __init__(self, tasks=None, difficulty=(0.0, 1.0), tg=True, lidar=True, layouts=1,
                  pool_seed=0, render_mode=None, gui=False):
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
-        low, high = difficulty if np.size(difficulty) == 2 else (difficulty, difficulty)
-        if not all(isinstance(d, Real) for d in (low, high)) or not 0 <= low <= high <= 1:
-            raise ValueError(f"difficulty must be in [0, 1] or (low, high), got {difficulty}")
-        if not isinstance(terrains, int) or terrains < 1:
-            raise ValueError(f"terrains must be a whole number of at least 1, got {terrains!r}")
-        self.render_mode, self.show_lidar, self.lidar = render_mode, False, lidar
+        numbers = np.shape(difficulty) == (2,) and all(isinstance(d, Real) for d in difficulty)
+        if not numbers or not 0 <= difficulty[0] <= difficulty[1] <= 1:
+            raise ValueError(f"difficulty must be (low, high) in [0, 1], got {difficulty}")
+        if not isinstance(layouts, (int, np.integer)) or layouts < 1:
+            raise ValueError(f"layouts must be a whole number of at least 1, got {layouts!r}")
         tasks = list(PILLAR_TASKS) if tasks is None else tasks
         tasks = tasks if isinstance(tasks, (list, tuple)) else [tasks]
         if not tasks:
             raise ValueError(f"tasks must hold at least one task; valid: {', '.join(PILLAR_TASKS)}")
         rng = np.random.default_rng(pool_seed)
-        self.pool = [make_terrain(task, rng, rng.uniform(low, high)) for task in tasks
-                     for _ in range(1 if isinstance(task, Terrain) else terrains)]
+        self.pool = [make_terrain(task, rng, rng.uniform(*difficulty)) for task in tasks
+                     for _ in range(1 if isinstance(task, Terrain) else layouts)]
+        self.render_mode, self.lidar, self.gui = render_mode, lidar, gui
         self.generator = TrajectoryGenerator() if tg else None
-        self._connect(gui)
-        rows, columns = LIDAR_AZIMUTHS.shape
-        self.scan_shape = rows * lidar, columns
-        n_scan = math.prod(self.scan_shape)
-        self.scan = np.zeros(n_scan, np.float32)
-        # Generous bounds: what lies beyond them is no longer a robot, and the episode ends.
-        high = [1e3, np.pi] + [1e3] * 3 + [1e2] * 24
-        high += [1.0] * TrajectoryGenerator.state_size * tg
-        low = np.concatenate([np.zeros(n_scan + 1), np.negative(high[1:])])
-        high = np.concatenate([np.ones(n_scan), high])
-        self.observation_space = gymnasium.spaces.Box(*np.float32([low, high]))
-        n_act = 12 + TrajectoryGenerator.action_size * tg
-        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (n_act,))
-        self.smoothing, self.residual = SMOOTHING[-n_act:], RESIDUAL[tg]
-        self.spent = np.zeros(len(self.pool))  # seconds in each terrain, those of failures cheap
-        self.time = 0.0
-
-    def _connect(self, gui):
-        self.visual = visual = gui or self.render_mode is not None
-        with _quiet():
-            mode = pybullet.GUI if gui else pybullet.DIRECT
-            self.bullet = p = BulletClient(connection_mode=mode)
-            p.configureDebugVisualizer(p.COV_ENABLE_GUI, 0)
-        for name in HOT:  # BulletClient looks a function up anew for each call, which costs 3 us
-            setattr(p, name, getattr(p, name))
-        p.setGravity(0, 0, -GRAVITY)
-        p.setPhysicsEngineParameter(fixedTimeStep=DT, numSubSteps=SUBSTEPS, numSolverIterations=20,
-                                    enableConeFriction=0, deterministicOverlappingPairs=1)
-        # Side by side, farther apart than the LiDAR reaches: a reset only moves the robot.
-        self.offsets, edge = [], 0.0
-        for terrain in self.pool:
-            low, high = terrain.vertices[:, 0].min(), terrain.vertices[:, 0].max()
-            self.offsets.append(edge - low)
-            edge += high - low + 2 * LIDAR_RANGE
-            self._add_mesh(terrain, self.offsets[-1], visual)
-        self._load_robot()
-        self.people, body = [], dict(shapeType=p.GEOM_CYLINDER, radius=PERSON_RADIUS)
-        for _ in range(max(len(terrain.people) for terrain in self.pool)):
-            shape = p.createCollisionShape(height=PERSON_HEIGHT, **body)
-            looks = p.createVisualShape(length=PERSON_HEIGHT, rgbaColor=(0.9, 0.5, 0.2, 1),
-                                        **body) if visual else -1
-            self.people.append(p.createMultiBody(0, shape, looks))
-        sources, directions = lidar_rays()
-        if visual:
-            sphere = p.createVisualShape(p.GEOM_SPHERE, radius=0.2, rgbaColor=(0.2, 0.8, 0.3, 1))
-            self.flag = p.createMultiBody(0, -1, sphere)
-        self._rays = sources.tolist(), (sources + LIDAR_RANGE * directions).tolist()
-        self._gains = dict(positionGains=[POSITION_GAIN] * 12, velocityGains=[VELOCITY_GAIN] * 12,
-                           forces=[MAX_TORQUE] * 12)
-        for _ in range(3):  # Bullet files what stands still elsewhere after two steps: it would
-            p.stepSimulation()  # change the last bits in the midst of the first episode
-
-    def _load_robot(self):
-        p = self.bullet
-        with tempfile.TemporaryDirectory() as folder:
-            urdf = Path(folder) / "laikago.urdf"
-            urdf.write_text(robot_urdf(self.visual))
-            self.robot = p.loadURDF(str(urdf), [0, 0, 1000])
-        joints = [p.getJointInfo(self.robot, j) for j in range(p.getNumJoints(self.robot))]
-        ids = {joint[1].decode(): joint[0] for joint in joints}
-        self.joints = [ids[f"{leg}_{joint}"] for leg in LEGS for joint in JOINTS]
-
-    def _add_mesh(self, terrain, offset, visual):
-        p = self.bullet
-        mesh = dict(vertices=terrain.vertices.tolist(), indices=terrain.triangles.ravel().tolist())
-        shape = p.createCollisionShape(p.GEOM_MESH, flags=p.GEOM_FORCE_CONCAVE_TRIMESH, **mesh)
-        body = p.createMultiBody(0, shape, basePosition=(offset, 0, 0))
-        p.changeDynamics(body, -1, lateralFriction=1.0)
-        if not visual:
-            return
-        # Ground and walls in colours of their own: shading alone does not tell them apart.
-        a, b, c = (terrain.vertices[terrain.triangles[:, k]] for k in range(3))
-        normal = np.cross(b - a, c - a)
-        steep = np.abs(normal[:, 2]) < 0.5 * np.linalg.norm(normal, axis=1)
-        for part, colour in ((~steep, (0.75, 0.78, 0.66, 1)), (steep, (0.6, 0.47, 0.4, 1))):
-            if part.any():
-                mesh["indices"] = terrain.triangles[part].ravel().tolist()
-                looks = p.createVisualShape(p.GEOM_MESH, rgbaColor=colour, **mesh)
-                p.createMultiBody(0, -1, looks, basePosition=(offset, 0, 0))
-
-    # ---------------------------------------------------------------- one episode
+        self.observation_space = box(observation_parts(tg, lidar))
+        self.action_space = box(action_parts(tg))
+        n_tg = len(self.action_space.low) - 12
+        self.smoothing = [SMOOTHING["tg"]] * n_tg + [SMOOTHING["joints"]] * 12
+        self.residual = RESIDUAL[bool(tg)]
+        self.simulation = Simulation(self.pool, render_mode is not None, gui)
+        self.robot = None  # no episode yet
 
     def reset(self, *, seed=None, options=None):
         """Stands the robot at a start; `options={"terrain": i, "route": k}` chooses which.
 
         Raises ValueError for another option, or one that the pool has not.
         """
+        self._check_open()
         super().reset(seed=seed)
-        p, rng, options = self.bullet, self.np_random, options or {}
-        # The terrain that has had least so far comes next. Seconds are shared, not episodes, or
-        # those that end in an early fall, and need it most, would get the least experience; and
-        # where the robot still fails it trains up to six times as long as where it arrives.
-        if self.time:
-            progress = self._info(self.distance < GOAL_RADIUS, False)["t_cr"]
-            self.spent[self.index] += self.time / (1.2 - progress)
-        if seed is not None:  # Bullet's contact caches would remember the episodes before
-            p.removeBody(self.robot)
-            self._load_robot()
-            self.spent[:] = 0
-        least = np.flatnonzero(self.spent == self.spent.min())
-        index = options.get("terrain", rng.choice(least))
-        if not set(options) <= {"terrain", "route"} or index not in range(len(self.pool)):
-            known = f"terrain, in range({len(self.pool)}), and route"
-            raise ValueError(f"options may be {known}, got {options}")
-        self.index, self.terrain = int(index), self.pool[int(index)]
-        terrain = self.terrain
-        route = options.get("route", rng.integers(len(terrain.starts)))
-        if route not in range(len(terrain.starts)):
-            raise ValueError(f"route must be in range({len(terrain.starts)}), got {route!r}")
-        self.route = route = int(route)
-        self.origin = np.array([self.offsets[self.index], 0.0, 0.0])
-        x, y, z, yaw = terrain.starts[route]
-        self.goal = (terrain.goals[route] + self.origin + [0, 0, BASE_HEIGHT]).tolist()
-        yaw += rng.uniform(-0.5, 0.5)
-
-        self.target = STANDING.tolist()
+        rng, options = self.np_random, dict(options or {})
+        index = options.pop("terrain", rng.integers(len(self.pool)))
+        if index not in range(len(self.pool)) or set(options) - {"route"}:
+            raise ValueError(f"options may be terrain, in range({len(self.pool)}), and route, "
+                             f"got {index!r}, {options}")
+        starts = self.pool[int(index)].starts
+        route = options.get("route", rng.integers(len(starts)))
+        if route not in range(len(starts)):
+            raise ValueError(f"route must be in range({len(starts)}), got {route!r}")
+        self.terrain, self.origin = self.pool[int(index)], self.simulation.origins[int(index)]
+        x, y, z, yaw = starts[int(route)]
+        self.goal = (self.terrain.goals[int(route)] + self.origin + [0, 0, BASE_HEIGHT]).tolist()
+        self.action = [0.0] * len(self.smoothing)  # in force, after smoothing
+        self.target = STANDING.tolist()  # of the joints
         if self.generator:
             self.generator.reset(rng.uniform(0, 2 * np.pi))
-            self.target = self.generator.step([0.0] * self.generator.action_size, 0.0).tolist()
-        self.action = [0.0] * len(self.smoothing)
-        position = self.origin + [x, y, z + BASE_HEIGHT + 0.02]
-        p.resetBasePositionAndOrientation(self.robot, position, _about_z(yaw))
-        p.resetBaseVelocity(self.robot, [0, 0, 0], [0, 0, 0])
-        for joint, angle in zip(self.joints, self.target, strict=True):
-            p.resetJointState(self.robot, joint, angle)
-        self.time, self.steps, self.collisions = 0.0, 0, 0
-        self.touching = self.exploded = False
-        self.walked = np.zeros(len(self.people))  # seconds that each of them has been walking
-        for body in self.people:  # not all terrains have as many
-            p.resetBasePositionAndOrientation(body, (0, 0, -1000), (0, 0, 0, 1))
-        self._move_people()
-        observation = self._observe()
-        self.start_distance = self.distance
-        if self.visual:
-            p.resetBasePositionAndOrientation(self.flag, self.goal, (0, 0, 0, 1))
-            dx, dy, _ = np.subtract(self.goal, self.position)
-            self.view_yaw = math.degrees(math.atan2(dy, dx)) - 90
-        return observation, self._info(False, False)
+            self.target = self.generator.step(self.action[:-12], 0.0)
+        position = np.add(self.origin, (x, y, z + BASE_HEIGHT + 0.02)).tolist()
+        for person in self.terrain.people:
+            person.reset()
+        self.simulation.move_people(self.terrain, self.origin)
+        self.simulation.place(position, yaw + rng.uniform(-0.5, 0.5), self.target)
+        self.collisions, self.touching, self.seconds = 0, False, 0.0
+        self.robot = self.simulation.sense()
+        self.start_distance = self._distance(self.robot)
+        self.simulation.bullet.resetBasePositionAndOrientation(
+            self.simulation.flag, self.goal, (0, 0, 0, 1))
+        return self.observe(), self._info(False, False)
 
     def step(self, action):
-        p = self.bullet
+        self._check_open(running=True)
         action = np.asarray(action, dtype=np.float64)
-        if action.shape != self.action_space.shape or not math.isfinite(sum(action.tolist())):
+        if action.shape != self.action_space.shape or not np.isfinite(action).all():
             raise ValueError(f"action must be {len(self.action)} finite numbers, got {action}")
-        # Plain floats: NumPy is slow on so few numbers.
-        pairs = zip(self.action, action.tolist(), self.smoothing, strict=True)
-        self.action = [old + k * (min(max(new, -1.0), 1.0) - old) for old, new, k in pairs]
-        u_tg = self.generator.step(self.action[:-12], DT) if self.generator else STANDING
-        pairs = zip(u_tg.tolist(), self.action[-12:], strict=True)
-        self.target = [u + self.residual * a for u, a in pairs]  # u_tg + u_fb
-        p.setJointMotorControlArray(self.robot, self.joints, p.POSITION_CONTROL,
-                                    self.target, **self._gains)
-        p.stepSimulation()
-        self.time += DT
-        if self.people:
-            contacts = [p.getContactPoints(self.robot, body) for body in self.people]
-            before, self.touching = self.touching, any(contacts)
-            self.collisions += self.touching and not before
-            for k, points in enumerate(contacts):
-                self.walked[k] += DT if sum(point[9] for point in points) < PUSH else -DT
-            self._move_people()
+        action = [min(max(a, -1.0), 1.0) for a in action.tolist()]
+        before = self._distance(self.robot)
+        for _ in range(HOLD):
+            self._control(action)
+        if self.terrain.people:
+            touching = self.simulation.touches_people()
+            self.collisions += touching and not self.touching
+            self.touching = touching
+        robot = self.simulation.sense()
+        if not math.hypot(self._distance(robot), *robot.rates) < EXPLODED:  # or NaN
+            self.simulation.bullet.disconnect()  # NaN has spread in it
+            self.simulation = Simulation(self.pool, self.render_mode is not None, self.gui)
+            info = self._info(False, True) | {"exploded": True}
+            return np.zeros(self.observation_space.shape, np.float32), 0.0, True, False, info
+        self.robot = robot
+        success = self._distance(robot) < GOAL_RADIUS
+        fall = not success and (robot.up < FALL_UP or robot.sink > FALL_SPEED)
+        reward = (before - self._distance(robot)) / (HOLD * DT)
+        return self.observe(), reward, success or fall, False, self._info(success, fall)
 
-        self.steps += 1
-        distance = self.distance
-        observation = self._observe(self.steps % LIDAR_EVERY == 0)
-        if not math.hypot(self.distance, *self.rates) < EXPLODED:  # not: NaN compares to nothing
-            p.removeBody(self.robot)
-            self._load_robot()
-            self.distance, self.exploded = distance, True
-            return np.zeros_like(observation), 0.0, True, False, self._info(False, True)
-        success = self.distance < GOAL_RADIUS
-        fall = self.up < FALL_UP or self.velocity[2] < -FALL_SPEED
-        reward = (distance - self.distance) / DT
-        return observation, reward, success or fall, False, self._info(success, fall)
+    def _control(self, action):
+        """One control step: smoothing, trajectory generator, residuals, physics, people."""
+        triples = zip(self.action, action, self.smoothing, strict=True)
+        self.action = [old + share * (new - old) for old, new, share in triples]
+        u_tg = STANDING.tolist()
+        if self.generator:
+            u_tg = self.generator.step(self.action[:-12], DT)
+        pairs = zip(u_tg, self.action[-12:], strict=True)
+        self.target = [u + self.residual * a for u, a in pairs]  # u_tg + u_fb
+        self.simulation.step(self.target)
+        self.seconds += DT
+        if self.terrain.people:
+            x, y, _ = np.subtract(self.robot.position, self.origin)
+            for person in self.terrain.people:
+                person.walk(DT, (x, y))
+            self.simulation.move_people(self.terrain, self.origin)
+
+    def _distance(self, robot):
+        """From the robot's base to the goal, m."""
+        return math.dist(self.goal, robot.position)
+
+    def observe(self):
+        """The observation, whose order is that of `observation_parts`, (n_obs,) float32."""
+        robot, scan = self.robot, []
+        if self.lidar:
+            # The root: as fine as a scan of 3 m is near by, and yet it looks across a room.
+            scan = [math.sqrt(hit[2]) for hit in self.simulation.scan()]
+        dx, dy, _ = np.subtract(self.goal, robot.position).tolist()
+        heading = math.remainder(math.atan2(dy, dx) - robot.yaw, 2 * math.pi)
+        s_tg = self.generator.state() if self.generator else []
+        return np.float32([*scan, self._distance(robot), heading, *robot.rates, *robot.joints,
+                           *self.target, *s_tg])
 
     def _info(self, success, fall):
-        progress = 1.0 if success else 1.0 - self.distance / self.start_distance
+        progress = 1.0 if success else 1.0 - self._distance(self.robot) / self.start_distance
         return {"task": self.terrain.name, "t_cr": max(0.0, progress), "success": success,
-                "fall": fall and not success, "collisions": self.collisions,
-                "exploded": self.exploded}
-
-    def _move_people(self):
-        for body, person, t in zip(self.people, self.terrain.people, self.walked, strict=False):
-            x, y, yaw = person.position(t)
-            place = x + self.origin[0], y, self.terrain.height(x, y) + PERSON_HEIGHT / 2
-            self.bullet.resetBasePositionAndOrientation(body, place, _about_z(yaw))
-
-    def _observe(self, turn_lidar=True):
-        p = self.bullet
-        position, quaternion = p.getBasePositionAndOrientation(self.robot)
-        self.velocity, self.rates = p.getBaseVelocity(self.robot)
-        r = p.getMatrixFromQuaternion(quaternion)
-        self.position, self.rotation, self.up = position, r, r[8]
-        self.distance = math.dist(self.goal, position)
-        self.yaw = math.atan2(r[3], r[0])
-        heading = math.atan2(self.goal[1] - position[1], self.goal[0] - position[0]) - self.yaw
-        state = [self.distance, (heading + math.pi) % (2 * math.pi) - math.pi]
-        wx, wy, wz = self.rates
-        state += [r[i] * wx + r[3 + i] * wy + r[6 + i] * wz for i in range(3)]
-        state += [joint[0] for joint in p.getJointStates(self.robot, self.joints)]
-        state += self.target
-        if self.generator:
-            state += self.generator.state()
-        observation = np.empty(self.scan.size + len(state), np.float32)
-        observation[self.scan.size :] = state
-        if turn_lidar and self.lidar and math.isfinite(self.distance):
-            self.hits = p.rayTestBatch(*self._rays, parentObjectUniqueId=self.robot,
-                                       parentLinkIndex=-1, collisionFilterMask=STATIC_GROUP)
-            self.fractions = np.fromiter(map(HIT_FRACTION, self.hits), np.float32, N_RAYS)
-            # The root: as fine as a scan of 3 m is near by, and yet it looks across a room.
-            self.scan = np.sqrt(self.fractions)
-        observation[: self.scan.size] = self.scan
-        return observation
+                "fall": fall, "collisions": self.collisions, "exploded": False}
 
     def render(self):
-        """The robot from above and behind, as uint8 (300, 400, 3).
+        """The robot and the terrain around it, uint8 (300, 400, 3).
 
         Raises ValueError if the environment was made without render_mode.
         """
-        if not self.visual:
+        if self.render_mode is None:
             raise ValueError("render() needs render_mode='rgb_array'")
-        p, (width, height) = self.bullet, PICTURE
-        view = p.computeViewMatrixFromYawPitchRoll(self.position, 2.4, self.view_yaw, -52, 0, 2)
-        projection = p.computeProjectionMatrixFOV(55, width / height, 0.1, 40)
-        rgba = p.getCameraImage(width, height, view, projection, lightDirection=(2, 3, 8),
-                                renderer=p.ER_TINY_RENDERER)[2]
-        picture = np.reshape(rgba, (height, width, 4))[..., :3].astype(np.uint8)
-        if self.show_lidar and self.lidar:
-            points = np.reshape([(*hit[3], 1.0) for hit in self.hits if hit[2] < 1], (-1, 4))
-            matrices = [np.reshape(m, (4, 4)) for m in (view, projection)]  # both transposed
-            x, y, _, w = (points @ matrices[0] @ matrices[1]).T
-            columns, rows = (1 + x / w) / 2 * width, (1 - y / w) / 2 * height
-            for dx, dy in ((0, 0), (1, 0), (0, 1), (1, 1)):
-                i, j = (rows + dy).astype(int), (columns + dx).astype(int)
-                seen = (w > 0) & (i >= 0) & (i < height) & (j >= 0) & (j < width)
-                picture[i[seen], j[seen]] = (220, 30, 30)
-        return picture
+        self._check_open(running=True)
+        dx, dy, _ = np.subtract(self.goal, self.robot.position)
+        return self.simulation.picture(self.robot.position, math.atan2(dy, dx))
+
+    def _check_open(self, running=False):
+        if self.simulation is None:
+            raise gymnasium.error.ClosedEnvironmentError("this environment is closed")
+        if running and self.robot is None:
+            raise gymnasium.error.ResetNeeded("call reset() first")
 
     def close(self):
-        if self.bullet is not None:
-            with _quiet():  # the window says goodbye at length
-                self.bullet.disconnect()
-            self.bullet = None
+        if self.simulation is not None:
+            with quiet():  # the window says goodbye at length
+                self.simulation.bullet.disconnect()
+            self.simulation = self.robot = None
 
 
 if "LocoMTRL-v0" not in gymnasium.registry:  # run as a script, this file is imported once more
-    gymnasium.register("LocoMTRL-v0", "loco_mtrl:LocoEnv", max_episode_steps=MAX_EPISODE_STEPS)
+    gymnasium.register("LocoMTRL-v0", "loco_mtrl:LocoEnv", max_episode_steps=300)
 
 
-# ------------------------------------------------------------------------------- ours: map, guide
-
-# What the paper has not: a guide in training (`Guide`), and a map among what the robot observes.
-OURS = ("guide", "map")
-CHART_RADII = 0.6, 1.5, 2.7, 4.5  # m: how far along a way its effort is observed
-CHART_EVERY = 10  # control steps from one drawing of the map to the next
-_LINES = np.radians(LIDAR_AZIMUTHS[0])  # the ways: one along each of the scan's columns
-_PACES = np.arange(0.3, 4.6, 0.3)  # m, the places on a line
-_PLACES, _TURN = _PACES[:, None] * np.exp(1j * _LINES), 0.3 * np.abs(_LINES) / np.pi
-_CHARTED = np.isin(np.round(_PACES, 1), CHART_RADII)
-LOG_WALL = math.log1p(225)  # all the way in a wall: what is observed are logarithms, in [0, 1]
-
-
-def weigh_ways(chart, x, y, yaw):
-    """What it would take, by the map, to go straight along each of the scan's columns from x, y.
-
-    Returns, in metres of open ground, the effort of going as far as each of _PACES (15, 24); and
-    the least that going by each column costs in all (24,): the effort to some place on it, from
-    0.6 m on, what is left from there to the goal, and up to 0.3 m for the turn.
-    """
-    places = complex(x, y) + cmath.rect(1.0, yaw) * _PLACES
-    x, y = places.real, places.imag
-    way = 0.3 * chart.effort(x, y).cumsum(0)
-    whole = (way + chart.to_go(x, y))[1:].min(0)  # nearer, all columns would look alike
-    return way, whole + _TURN
-
-
-class Map(gymnasium.Wrapper):
-    """A robot that draws a map from its LiDAR's hits as it goes, `terrain.Chart`: ours.
-
-    ## Observation: Box((402,), float32): LocoEnv's, and after its scan
-    | entries | meaning | unit |
-    |---|---|---|
-    | 96 | effort of going 0.6, 1.5, 2.7, 4.5 m along each of the scan's columns | * |
-    | 24 | what going each column's way costs in all, less the cheapest: `weigh_ways` | * |
-    *: log(1 + metres of open ground) / log(226), in [0, 1]. Taken with each scan, at 15 Hz; the map
-    is drawn anew every CHART_EVERY control steps.
-
-    observed: False: the map is drawn, for a guide, but the observation remains LocoEnv's.
-    Raises ValueError if the robot is blind.
-    """
-
-    def __init__(self, env, observed=True):
-        super().__init__(env)
-        self.robot, self.observed = env.unwrapped, observed
-        if not self.robot.lidar:
-            raise ValueError("a Map needs what the LiDAR sees: lidar must be True, got False")
-        (rows, columns), space = self.robot.scan_shape, env.observation_space
-        self.n_scan, n_map = rows * columns, (len(CHART_RADII) + 1) * columns * observed
-        self.scan_shape = rows + n_map // columns, columns
-        low, high = (np.insert(bound, self.n_scan, np.full(n_map, limit))
-                     for bound, limit in ((space.low, 0), (space.high, 1)))
-        self.observation_space = gymnasium.spaces.Box(low, high)
-        self.eyes, directions = lidar_rays()
-        self.reach = LIDAR_RANGE * directions
-
-    def reset(self, **kwargs):
-        observation, info = self.env.reset(**kwargs)
-        self.chart = Chart(*self.robot.position[:2], self.robot.goal)
-        self.scans = []  # seen, not on the chart yet
-        return self._look(observation), info
-
-    def step(self, action):
-        observation, *rest = self.env.step(action)
-        return self._look(observation), *rest
-
-    def _look(self, observation):
-        """Draws what the LiDAR has just seen and weighs the ways: the observation with them."""
-        robot, (x, y, z) = self.robot, self.robot.position
-        if robot.exploded:
-            self.seen = np.zeros_like(self.seen)
-        elif robot.steps % LIDAR_EVERY == 0:
-            self.scans.append((robot.fractions, robot.rotation, robot.position))
-            if robot.steps % CHART_EVERY == 0:
-                fractions, turns, places = map(np.array, zip(*self.scans, strict=True))
-                turns = turns.reshape(-1, 3, 3).transpose(0, 2, 1)
-                eyes = self.eyes @ turns + places[:, None]
-                hits = eyes + fractions[..., None] * (self.reach @ turns)
-                self.chart.see(eyes.reshape(-1, 3), hits.reshape(-1, 3), fractions.ravel() < 1,
-                               z - BASE_HEIGHT)
-                self.chart.draw(x, y, z - BASE_HEIGHT)
-                self.scans.clear()
-            way, self.whole = weigh_ways(self.chart, x, y, robot.yaw)
-            costs = np.append(way[_CHARTED], self.whole - self.whole.min())
-            self.seen = np.float32(np.log1p(costs) / LOG_WALL)
-        if not self.observed:
-            return observation
-        scan, rest = observation[: self.n_scan], observation[self.n_scan :]
-        return np.concatenate([scan, self.seen, rest])
-
-
-PACE = 0.21  # m, the guide's stride where his way is straight
-ASIDE = 0.12  # m, at most, that his left and right strides are shorter and longer in a bend
-
-
-def advise(env):
-    """What a guide would do: take the cheapest of the ways that the robot's own `Map` shows.
-
-    Without one he heads for the goal; on a slope he crouches. Returns an action (n_act,), NaN for
-    all but two strides and the stance height.
-    """
-    robot = env.unwrapped
-    advice = np.full(robot.action_space.shape, np.nan)
-    if robot.exploded:
-        return advice
-    (x, y, _), (to_x, to_y, _) = robot.position, robot.goal
-    turn = math.remainder(math.atan2(to_y - y, to_x - x) - robot.yaw, 2 * math.pi)
-    if robot.distance > 0.7 and env.has_wrapper_attr("whole"):
-        turn = _LINES[env.get_wrapper_attr("whole").argmin()]
-    # The strides: slower in a bend, on the spot where the way lies to the side or behind.
-    forward = PACE * max(0.0, math.cos(turn)) ** 2
-    aside = ASIDE * min(max(1.2 * turn, -1.0), 1.0)
-    strides = np.array([forward - aside, forward + aside])
-    advice[1:3] = np.clip((strides - CENTRE[1:3]) / RANGE[1:3], -0.95, 0.95)
-    tilt = math.acos(min(robot.up, 1.0))
-    advice[4] = -min(max(5 * (tilt - 0.1), 0.0), 0.95)
-    return advice
-
-
-class Guide(gymnasium.Wrapper):
-    """Tells a robot in training the way: info["guide"] is what `advise` says.
-
-    He is no part of the policy, only of what it learns from: which way to go. The rest, NaN in his
-    advice, it finds out for itself.
-    """
-
-    def reset(self, **kwargs):
-        observation, info = self.env.reset(**kwargs)
-        return observation, info | {"guide": advise(self)}
-
-    def step(self, action):
-        *rest, info = self.env.step(action)
-        return *rest, info | {"guide": advise(self)}
-
-
-def make_env(tasks, lidar=True, paper=(), guide=False, **options):
-    """A robot as in training and scoring: LocoMTRL-v0 in a `Map`, in training with a `Guide`.
-
-    paper: with "map" among them it does not observe one, and a blind robot has none.
-    options: LocoEnv's.
-    """
-    env = gymnasium.make("LocoMTRL-v0", tasks=tasks, lidar=lidar, disable_env_checker=True,
-                         **options)
-    if lidar and (guide or "map" not in paper):
-        env = Map(env, observed="map" not in paper)
-    return Guide(env) if guide else env
-
-
-def mirror(env):
-    """The left-right symmetry: mirrored, o becomes o[i] * s and an action a becomes a[j] * t.
-
-    Returns:
-        (i, s, j, t): indices and signs over the observation, then over the action.
-    """
-    legs = np.arange(12).reshape(4, 3)[[1, 0, 3, 2]].ravel()  # joint angles mirror unsigned
-    swap, tg = np.array([1, 0, 3, 2]), bool(env.unwrapped.generator)
-    parameters = np.array([0, 2, 1, 3, 4])  # left and right stride change places
-    shape = env.get_wrapper_attr("scan_shape")
-    scan = np.arange(math.prod(shape)).reshape(shape)[:, ::-1].ravel()
-    parts = [scan, np.arange(5), legs, legs] + [swap, swap, parameters] * tg
-    actions = [parameters] * tg + [legs]
-    signs = np.ones(env.observation_space.shape)
-    signs[scan.size + np.array([1, 2, 4])] = -1  # heading, roll rate, yaw rate
-    chain = [np.concatenate([p + sum(map(len, group[:k])) for k, p in enumerate(group)])
-             for group in (parts, actions)]
-    return chain[0], signs, chain[1], np.ones(env.action_space.shape)
+def make_env(tasks, seconds=30, **options):
+    """A LocoEnv whose episodes last at most so many seconds. options: LocoEnv's."""
+    return gymnasium.make("LocoMTRL-v0", tasks=tasks, disable_env_checker=True,
+                          max_episode_steps=round(seconds / DT / HOLD), **options)
 
 
 # ------------------------------------------------------------------------------- train
 
 REWARD_SCALE = 0.1  # keeps the critic's targets near 1
-MAIN_STEPS = 240_000  # of the no-argument run
-EASY_PART = 0.6  # of all steps: until it knows how to walk, difficulties are drawn from 0 on ...
-HARD = (0.4, 1.0)  # ... and then from here
-LAYOUTS = 10  # of an environment, at most: the more it sees, the less it learns by heart
+LAYOUTS = 8  # terrains of each training environment, in one leg
+LEG = 400_000  # steps; then every process starts itself afresh, on new layouts
 
 
-def training_env(index, seed, tasks, stage=0, **options):
-    """Environment number `index` over all ranks: one of the tasks, on layouts of its own.
+def training_env(index, leg, args):
+    """Environment number `index` over all ranks, in leg (number, task): one task, new layouts.
 
-    So all tasks have the same share of every batch, but for what does not divide evenly.
+    Every environment keeps to one task, so all tasks have the same share of every batch. One task
+    after the other (--sequential), the leg's task has all environments.
     """
-    env = make_env(tasks[index % len(tasks)], terrains=min(len(tasks), LAYOUTS),
-                   pool_seed=(seed, stage, index), **options)
+    number, k = leg
+    task = args.tasks[k if args.sequential else index % len(args.tasks)]
+    env = make_env(task, tg=args.tg, lidar=args.lidar, layouts=LAYOUTS,
+                   pool_seed=(args.seed, number, k, index))
     return gymnasium.wrappers.TransformReward(env, lambda reward: REWARD_SCALE * reward)
 
 
-def plan(args):
-    """The stages of a training: (tasks, difficulties, share of all steps done at its end, settings)
-
-    With a guide the policy first does as he does, by large steps that no noise of rewards misleads.
-    Then, and without a guide from the beginning, it learns by PPO. One task after the other
-    (--sequential), it has no time but for the first.
-    """
-    # Short rollouts and large steps learn fastest at first; later the noise of so few samples holds
-    # the policy back. A detour pays after many seconds: 200 steps, 1 / (1 - 0.995), are 6.7 s, and
-    # later it is 17 s. At last there is little exploration noise: who is used to much of it is not
-    # at his best without.
-    first = dict(num_steps=256, gamma=0.995, update_epochs=2, learning_rate=5e-4, target_kl=0.05)
-    last = first | dict(num_steps=512, gamma=0.998, target_kl=0.02, max_std=0.10)
-    if args.tg and "guide" not in args.paper:
-        # Advice has no noise that a trust region would have to guard against: a step size of 1e-3,
-        # whatever the KL.
-        rates = "learning_rate", "min_learning_rate", "max_learning_rate"
-        first |= dict.fromkeys(rates, 1e-3) | dict(guide_share=1.0, target_kl=1e9, max_std=0.12)
-        last |= dict(guide_share=0.5, min_learning_rate=1e-5, learning_rate=1e-4,
-                     max_learning_rate=1e-4)
-    if args.sequential:  # one task after the other (section 3), each for as long
-        n = len(args.tasks)
-        return [([task], (0, 1), (k + 1) / n, first) for k, task in enumerate(args.tasks)]
-    return [(args.tasks, (0, 1), EASY_PART, first), (args.tasks, HARD, 1.0, last)]
+def leg_of(steps, args):
+    """The leg to which a step belongs: (number, index of the task with --sequential, else 0)."""
+    n = len(args.tasks) if args.sequential else 1
+    return steps // LEG, min(n * steps // args.steps, n - 1)
 
 
 def train(args):
-    """`train`: one rank per core unless torchrun has started us already."""
-    run_dir = Path(args.run_dir)
-    if "WORLD_SIZE" not in os.environ and args.ranks > 1:
+    """`train`: one process for each core, unless torchrun has started them already."""
+    if "RANK" not in os.environ:
         return launch(args)
-    options = {"tg": args.tg, "lidar": args.lidar, "paper": args.paper}
-    meta = {**options, "tasks": args.tasks, "sequential": args.sequential,
-            "seed": args.seed, "command": shlex.join(["python", "loco_mtrl.py", *args.argv]),
-            "commit": _commit()}
-    stages = plan(args)
-    with contextlib.closing(make_env("flat", **options)) as env:
-        symmetry, scan = mirror(env), env.get_wrapper_attr("scan_shape")
-    n_tg = TrajectoryGenerator.action_size * args.tg
-    # Without the generator the joints' actions are worth six times as many radians.
-    init_std = (0.37,) * n_tg + (0.37 if args.tg else 0.25,) * 12
-    noise_correlation = (0.9,) * n_tg + (0.0,) * 12  # 0.3 s: turns and stops are tried as such
-    ranks = int(os.environ.get("WORLD_SIZE", 1))
-    restarted = os.environ.get("TORCHELASTIC_RESTART_COUNT", "0") != "0"  # torchrun, after a crash
-    resume, first = args.resume or restarted, int(os.environ.get("RANK", 0)) == 0
-    on_update = tensorboard(run_dir) if args.tensorboard and first else None
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    first, run_dir = os.environ["RANK"] == "0", Path(args.run_dir)
+    legs, checkpoint = int(os.environ.get("PPO_LEG", 0)), run_dir / "checkpoint.pt"
+    crashed = os.environ.get("TORCHELASTIC_RESTART_COUNT", "0") != "0"  # torchrun starts us again
+    meta = {name: getattr(args, name) for name in ("tg", "lidar", "tasks", "sequential", "seed")}
+    observation, action = observation_parts(args.tg, args.lidar), action_parts(args.tg)
+    config = PPOConfig(
+        total_timesteps=args.steps, seed=args.seed, n_scan=N_RAYS * args.lidar,
+        init_std=tuple(part.std for part in action for _ in range(part.size)))
     try:
-        # Each stage resumes the one before.
-        for k, (tasks, difficulty, share, settings) in enumerate(stages):
-            resume |= k > 0
-            if args.stage not in (None, k):
-                continue
-            # At least 20 environments, as many for each task, shared among the ranks.
-            num_envs = math.ceil(len(tasks) * math.ceil(20 / len(tasks)) / ranks)
-            config = PPOConfig(
-                total_timesteps=round(share * args.steps), num_envs=num_envs, seed=args.seed,
-                num_minibatches=min(settings["num_steps"] // 50, 16), exteroceptive=scan,
-                checkpoint_every=10_000 // settings["num_steps"],
-                encoder_hidden=(128, 128), trunk_hidden=(128, 128),
-                init_std=init_std, noise_correlation=noise_correlation,
-                gae_lambda=0.98, max_advantage=1.0, **settings,
-            )
-            training = partial(training_env, seed=args.seed, tasks=tasks, stage=k,
-                               guide=config.guide_share > 0, difficulty=difficulty, **options)
-            learn(training, config, run_dir=run_dir, resume=resume, mirror=symmetry, meta=meta,
-                  episode_keys=("t_cr", "success", "fall", "exploded"), groups=args.tasks,
-                  on_update=on_update)
+        model, steps = learn(
+            functools.partial(training_env, args=args), config, run_dir=run_dir,
+            resume=args.resume or legs > 0 or crashed and checkpoint.exists(), meta=meta,
+            mirror=(mirror(observation), mirror(action)), leg=functools.partial(leg_of, args=args),
+            episode_keys=("t_cr", "success", "fall", "exploded"), groups=args.tasks,
+            on_update=tensorboard(run_dir) if args.tensorboard and first else None)
     except KeyboardInterrupt:
         if first:
-            print(f"\nStopped. To go on from the last checkpoint: {_again(args)}")
+            print(f"\nStopped. To go on: {again(args)}" if checkpoint.exists() else "\nStopped.")
         return 130
+    if steps < args.steps:  # Bullet gives no memory back but to a new process
+        if torch.distributed.is_initialized():
+            torch.distributed.destroy_process_group()
+        os.environ["PPO_LEG"] = str(legs + 1)
+        os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
     if first:
-        checkpoint = load_checkpoint(run_dir / "checkpoint.pt")
-        # To be shared: who acts needs no critic, and half the bits change an action by less than a
-        # thousandth.
-        checkpoint["optimiser"] = None
-        checkpoint["model"] = {name: tensor.half() if tensor.dtype == torch.float32 else tensor
-                               for name, tensor in checkpoint["model"].items()
-                               if not name.startswith("critic.")}
-        write_whole(checkpoint, run_dir / "policy.pt")
-        if args.stage is None:
-            print(MADE.format(run_dir))
+        save_policy(run_dir / "policy.pt", model, meta)
+        print(f"Policy: {run_dir}/policy.pt   Curve: {run_dir}/curve.png")
     return 0
+
+
+@contextlib.contextmanager
+def deaf():
+    """What is started here does not hear Ctrl-C, until it says otherwise."""
+    previous = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, previous)
+
+
+def launch(args):
+    """Starts one process for each rank, as torchrun would, and waits for them."""
+    n_ranks = min(args.ranks, PPOConfig.num_envs)
+    store = torch.distributed.TCPStore("127.0.0.1", 0, is_master=True, wait_for_workers=False)
+    shared = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(store.port), "OMP_NUM_THREADS": "1",
+              "WORLD_SIZE": str(n_ranks), "TORCHELASTIC_USE_AGENT_STORE": "True"}
+    command = [sys.executable, __file__, *args.argv]
+    with Interrupt():  # ranks hear of Ctrl-C by themselves
+        with deaf():
+            ranks = [subprocess.Popen(command, env=os.environ | shared | {"RANK": str(rank)})
+                     for rank in range(n_ranks)]
+        while None in (codes := [rank.poll() for rank in ranks]) and not any(codes):
+            time.sleep(0.1)
+        for rank in ranks:  # where one fails, the others notice, or wait for it in vain
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                rank.wait(None if 130 in codes else 10)
+            rank.terminate()
+        codes = [rank.wait() for rank in ranks]
+    for rank, code in enumerate(codes):
+        if code in (-signal.SIGKILL, -signal.SIGSEGV):
+            print(f"loco_mtrl.py: error: rank {rank} was killed by signal {-code}. "
+                  f"To go on from the last checkpoint: {again(args)}", file=sys.stderr)
+    return next((abs(code) for code in codes if code), 0)
+
+
+def again(args):
+    """The command that resumes this run."""
+    kept = [argument for argument in args.argv or ["train"] if argument != "--resume"]
+    return shlex.join(["python", "loco_mtrl.py", *kept, "--resume"])
 
 
 def tensorboard(run_dir):
     """An `on_update` for `learn` that also writes progress.csv's columns for TensorBoard."""
-    try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError:
-        raise ValueError("--tensorboard needs TensorBoard: pip install tensorboard") from None
+    from torch.utils.tensorboard import SummaryWriter
+
     writer = SummaryWriter(run_dir)
 
     def on_update(_, row):
@@ -784,70 +668,9 @@ def tensorboard(run_dir):
     return on_update
 
 
-MADE = "Policy: {0}/policy.pt   Curve: {0}/curve.png"  # what a person needs of a training
-LOST = 3  # exit code of a rank that ends because another one is gone
-
-
-def launch(args):
-    """Starts one rank per core through torch's own launcher, and waits for them.
-
-    Once for each stage of the training: Bullet gives a layout's memory back only when its process
-    ends.
-    """
-    import torch.distributed.run as torchrun
-    from torch.distributed.elastic.multiprocessing import SignalException
-    from torch.distributed.elastic.multiprocessing.errors import ChildFailedError
-
-    logging.getLogger("torch.distributed.elastic").setLevel(logging.CRITICAL)
-    os.environ.setdefault("OMP_NUM_THREADS", "1")  # what torchrun would set, with a warning
-    command = ["--standalone", f"--nproc-per-node={args.ranks}", __file__, *args.argv, "--stage"]
-    run_dir = Path(args.run_dir)
-    try:
-        stages = plan(args)
-        for k, (_, _, share, _) in enumerate(stages):
-            if k or args.resume:  # a bad checkpoint is better named by one process
-                checkpoint = load_checkpoint(run_dir / "checkpoint.pt")
-                done = checkpoint["counters"]["steps"] >= round(share * args.steps)
-                if done and k + 1 < len(stages):  # the last one has policy.pt to write, too
-                    continue
-            torchrun.main([*command, str(k)])
-    except SignalException as stop:
-        return 128 + stop.sigval
-    except ChildFailedError as error:
-        codes = {rank: failure.exitcode for rank, failure in error.failures.items()}
-        for code in codes.values():
-            if code > 0 and code != LOST:
-                return code  # that rank itself has said what is wrong
-        # The launcher ends the other ranks by SIGTERM, and may record that, too.
-        killed = [rank for rank, code in codes.items() if code not in (LOST, -signal.SIGTERM)]
-        rank = (killed or list(codes))[0]
-        end = f"was killed by signal {-codes[rank]}" if codes[rank] < 0 else "lost the others"
-        print(f"loco_mtrl.py: error: rank {rank} {end}. "
-              f"To go on from the last checkpoint: {_again(args)}", file=sys.stderr)
-        return 1
-    print(MADE.format(run_dir))
-    return 0
-
-
-def _again(args):
-    """The command that resumes this run."""
-    kept = [a for a in args.argv if a != "--resume"]
-    return shlex.join(["python", "loco_mtrl.py", *kept, "--resume"])
-
-
-def _commit():
-    """The commit of this code, for the record of a run; empty outside a git checkout."""
-    command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"]
-    try:
-        return subprocess.run(command, capture_output=True, text=True).stdout.strip()
-    except OSError:
-        return ""
-
-
 # ------------------------------------------------------------------------------- eval
 
-EVAL_SECONDS = 60  # an episode's limit: 36 m at 0.6 m/s, three times the farthest goal
-GIF_EVERY = 4  # control steps a frame: 7.5 frames a second
+EVAL_SECONDS = 60  # an episode's limit
 EVAL_SEED = 10_000  # episode k of every policy in every world has seed EVAL_SEED + k
 # Tables 1 and 2, t_cr in the order of WORLDS: means, then standard deviations, in hundredths.
 PAPER = {
@@ -861,127 +684,130 @@ PAPER = {
     "sequential": "60 29 63 62 59 61 57 61  18 15 17 14 19 13 14 17",
     "ours": "72 67 84 83 79 78 70 72  13 12 11 13 14 10 17 19",
 }
+BLIND = {"lidar": False}  # LocoEnv's options for the references: they need no scan
 
 
-def zero_action(observation, env):
+def zero(observation):
     """The trajectory generator alone."""
-    return np.zeros(env.action_space.shape)
+    return np.zeros(17)
 
 
-def walk_straight(observation, env):
+def straight(observation):
     """Walks straight at the goal on the same trajectory generator: steers, but sees nothing."""
-    action = np.zeros(env.action_space.shape)
-    heading = observation[math.prod(env.get_wrapper_attr("scan_shape")) + 1]
-    action[1:3] = 0.75 + np.clip(heading, -0.6, 0.6) * np.array([-0.4, 0.4])  # two strides
-    return action
+    turn = 0.4 * np.clip(observation[1], -0.6, 0.6)
+    return np.array([0.0, 0.75 - turn, 0.75 + turn, *[0.0] * 14])
 
 
-def follow_guide(observation, env):
-    """The guide himself: the ways that the map shows, no learning, on the same generator."""
-    return np.nan_to_num(advise(env))
+REFERENCES = {"zero": zero, "straight": straight}
 
 
-REFERENCES = {"zero": zero_action, "straight": walk_straight, "guide": follow_guide}
-
-
+@functools.lru_cache
 def load_actor(name):
-    """(act, options, row): `act(observation, env)`, make_env's options, the name of its row in
-    PAPER, if it is there.
+    """(act, options, row): observation -> action, LocoEnv's options, the row's name in PAPER.
 
     `name` is a checkpoint's path or one of REFERENCES. Raises as `load_checkpoint` does.
     """
     if name in REFERENCES:
-        return REFERENCES[name], {}, None
-    model, checkpoint = load_policy(name)
-    meta = checkpoint["meta"] or {}
-    if not {"tg", "lidar", "paper", "tasks", "sequential"} <= set(meta):
+        return REFERENCES[name], BLIND, None
+    model, meta = load_policy(name)
+    if not {"tg", "lidar", "tasks", "sequential"} <= set(meta or {}) or not meta["tasks"]:
         raise ValueError(f"{name} is not a policy for LocoEnv: {meta}")
-    options, tasks = {k: meta[k] for k in ("tg", "lidar", "paper")}, meta["tasks"]
-    with contextlib.closing(make_env("flat", **options)) as env:
-        size, given = env.observation_space.shape[0], model.kwargs["obs_dim"]
-    if size != given:
-        raise ValueError(f"{name} takes observations of {given} numbers, a robot here gives {size}")
+    options, tasks = {"tg": meta["tg"], "lidar": meta["lidar"]}, meta["tasks"]
+    sizes = [sum(part.size for part in parts)
+             for parts in (observation_parts(**options), action_parts(meta["tg"]))]
+    given = [model.kwargs["obs_dim"], model.kwargs["act_dim"]]
+    if sizes != given:
+        raise ValueError(f"{name} is for observations and actions of {given} numbers, but a robot "
+                         f"here has {sizes}")
     kinds = {"reactive": not meta["tg"], "no vision": not meta["lidar"],
              "sequential": meta["sequential"], tasks[0]: len(tasks) == 1, "ours": True}
-    row = next(kind for kind, holds in kinds.items() if holds)
-    return lambda observation, env: model.mean_action(observation), options, row
+    return model.mean_action, options, next(kind for kind, holds in kinds.items() if holds)
 
 
 def make_place(place, seed):
-    """The terrain of episode `seed`: of a world, a task, or a mesh, (path, scale, up)."""
-    if isinstance(place, tuple):
-        return load_mesh(*place)
+    """The terrain of episode `seed`: of a world, a task on held-out seeds, or a given one."""
+    if isinstance(place, Terrain):
+        return place
     if place in WORLDS:
         return make_world(place, seed)
     rng = np.random.default_rng(seed)
     return make_terrain(place, rng, rng.uniform())
 
 
-def episodes(job):
-    """One episode of each actor: job = (place, seed, actors) -> job, [{t_cr, success, ...}, ...]"""
-    place, seed, actors = job
-    torch.set_num_threads(1)
-    terrain, results = make_place(place, seed), []
-    for actor in actors:
-        act, options, _ = load_actor(actor)
-        env = make_env(terrain, max_episode_steps=round(EVAL_SECONDS / DT), **options)
+def episode(actor, place, seed, **options):
+    """One episode, step by step: yields (env, info), at first of the reset."""
+    act, kind, _ = load_actor(actor)
+    env = make_env(make_place(place, seed), seconds=EVAL_SECONDS, **kind, **options)
+    with contextlib.closing(env):
         observation, info = env.reset(seed=seed)
         terminated = truncated = False
+        yield env.unwrapped, info
         while not (terminated or truncated):
-            observation, _, terminated, truncated, info = env.step(act(observation, env))
-        result = {k: float(info[k]) for k in ("t_cr", "success", "fall", "collisions")}
-        results.append(result | {"seconds": env.unwrapped.time})
-        env.close()
-    return job, results
+            observation, _, terminated, truncated, info = env.step(act(observation))
+            yield env.unwrapped, info
 
 
-def evaluate(actors, places, n_episodes, workers):
-    """Scores of every actor in every place: {place: a list of dicts for each actor}.
+def score(actor, place, seed):
+    """The score of one episode: {t_cr, success, fall, collisions, seconds}."""
+    torch.set_num_threads(1)
+    *_, (info, seconds) = ((info, env.seconds) for env, info in episode(actor, place, seed))
+    keys = ("t_cr", "success", "fall", "collisions")
+    return {key: float(info[key]) for key in keys} | {"seconds": seconds}
 
-    Every episode runs in an environment of its own, so the scores do not depend on `workers`.
+
+def evaluate(actors, places, n_episodes, workers, first_seed=EVAL_SEED):
+    """Scores of every actor in every place: {(actor, place's name): [score's dict, ...]}.
+
+    Every episode has an environment of its own, so the scores do not depend on `workers`.
+    Raises RuntimeError if a worker is killed.
     """
-    jobs = [(place, EVAL_SEED + k, actors) for place in places for k in range(n_episodes)]
-    scores = {place: [[None] * n_episodes for _ in actors] for place in places}
-    # Workers are replaced now and then: Bullet never gives a mesh's memory back.
-    with multiprocessing.get_context("spawn").Pool(workers, maxtasksperchild=20) as pool:
-        done = pool.imap_unordered(episodes, jobs)
-        for (place, seed, _), results in tqdm(done, total=len(jobs), unit="episode"):
-            for k, result in enumerate(results):
-                scores[place][k][seed - EVAL_SEED] = result
+    jobs = [(actor, place, first_seed + k)
+            for place in places for actor in actors for k in range(n_episodes)]
+    scores = {}
+    with tqdm(total=len(jobs), unit="episode") as bar:
+        while jobs:  # new workers now and then, for Bullet never frees a mesh
+            some, jobs = jobs[:200], jobs[200:]
+            pool = concurrent.futures.ProcessPoolExecutor(
+                workers, multiprocessing.get_context("spawn"))
+            try:
+                with deaf():
+                    results = pool.map(score, *zip(*some, strict=True))
+                for job, result in zip(some, results, strict=True):
+                    scores.setdefault((job[0], getattr(job[1], "name", job[1])), []).append(result)
+                    bar.update()
+            finally:
+                pool.shutdown(cancel_futures=True)
     return scores
 
 
 def eval_command(args):
     """`eval`: the table of the paper for one or more policies."""
-    if args.json:  # bad files are named before any work
-        Path(args.json).open("a").close()
-    rows = [load_actor(actor)[2] for actor in args.policies]
-    places = args.worlds
-    if args.mesh:
-        places = [(args.mesh, args.scale, args.up)]
-        load_mesh(*places[0])
+    kinds = {load_actor(actor)[2] for actor in args.policies}
+    places = [load_scan(args.scan, args.scale, args.up)] if args.scan else args.worlds
+    if args.json:  # a bad place is named before any work
+        check_writable(args.json)
     scores = evaluate(args.policies, places, args.episodes, args.ranks)
+    names = list(dict.fromkeys(name for _, name in scores))
     report = {"policies": args.policies, "episodes": args.episodes, "worlds": {}}
-    for place, runs in scores.items():
-        flat = [run for policy in runs for run in policy]
-        mean = {k: float(np.mean([run[k] for run in flat])) for k in flat[0]}
-        mean["std"] = float(np.std([run["t_cr"] for run in flat]))
-        mean["per_policy"] = [float(np.mean([run["t_cr"] for run in policy])) for policy in runs]
-        report["worlds"][Path(place[0]).stem if args.mesh else place] = mean
+    for name in names:
+        runs = [run for actor in args.policies for run in scores[actor, name]]
+        each = [float(np.mean([run["t_cr"] for run in scores[actor, name]]))
+                for actor in args.policies]
+        report["worlds"][name] = {
+            **{key: float(np.mean([run[key] for run in runs])) for key in runs[0]},
+            "std": float(np.std([run["t_cr"] for run in runs])), "per_policy": each}
     table = report["worlds"]
-    report["mean_t_cr"] = float(np.mean([world["t_cr"] for world in table.values()]))
-    lines = [("", list(table)), ("t_cr", [f"{w['t_cr']:.2f}" for w in table.values()]),
-             ("+- std", [f"{w['std']:.2f}" for w in table.values()])]
-    if len(set(rows)) == 1 and rows[0] in PAPER and list(table) == list(WORLDS):
-        figures = ["0." + figure for figure in PAPER[rows[0]].split()]
-        lines += [(f"paper: {rows[0]}", figures[:8]), ("+- std", figures[8:])]
-    for key in ("success", "fall", "collisions", "seconds"):
-        lines.append((key, [f"{w[key]:.2f}" for w in table.values()]))
+    lines = [("", names)] + [(key, [f"{table[name][key]:.2f}" for name in names]) for key in
+                             ("t_cr", "std", "success", "fall", "collisions", "seconds")]
+    if names == list(WORLDS):
+        for kind in [kind for kind in PAPER if kind in kinds]:
+            figures = ["0." + figure for figure in PAPER[kind].split()]
+            lines += [(f"paper: {kind}", figures[:8]), ("paper: std", figures[8:])]
     for name, cells in lines:
-        print(f"{name:18}" + "".join(f"{cell:>14}" for cell in cells))
+        print(f"{name:18}" + "".join(f"{cell:>12}" for cell in cells))
+    report["mean_t_cr"] = float(np.mean([world["t_cr"] for world in table.values()]))
     for k, actor in enumerate(args.policies):
-        each = np.mean([w["per_policy"][k] for w in table.values()])
-        print(f"mean t_cr {each:.3f}  {actor}")
+        print(f"mean t_cr {np.mean([w['per_policy'][k] for w in table.values()]):.3f}  {actor}")
     if args.json:
         Path(args.json).write_text(json.dumps(report, indent=2) + "\n")
     return 0
@@ -989,69 +815,65 @@ def eval_command(args):
 
 # ------------------------------------------------------------------------------- play, gallery
 
+GIF_EVERY = 2  # decisions a frame: 5 frames a second
+
+
+def check_writable(path):
+    """Raises OSError if a file cannot be written there; leaves no trace."""
+    existed = Path(path).exists()
+    with open(path, "a"):
+        pass
+    if not existed:
+        Path(path).unlink()
+
 
 def draw_map(axis, terrain):
-    """Draws a terrain from above: shaded heights, starts (white), goals (green), people's ways."""
+    """Draws a terrain from above: heights, starts (white), goals (green), ways, people's ways."""
     from matplotlib import colormaps
     from matplotlib.colors import LightSource
 
-    low, high = terrain.vertices[:, :2].min(0), terrain.vertices[:, :2].max(0)
-    x, y = (np.arange(a + 0.025, b, 0.05) for a, b in zip(low, high, strict=True))
+    length, width = np.array(terrain.heights.shape) * terrain.cell
+    x, y = np.arange(0.025, length, 0.05), np.arange(0.025 - width / 2, width / 2, 0.05)
     z = terrain.height(*np.meshgrid(x, y))
-    z = np.where(np.isfinite(z), z, z[np.isfinite(z)].min())
     span = dict(vmin=min(z.min(), -0.5), vmax=max(z.max(), 0.5))
-    shaded = LightSource(315, 40).shade(z, colormaps["cividis"], blend_mode="soft", **span)
-    axis.imshow(shaded, origin="lower", extent=(low[0], high[0], low[1], high[1]))
+    shaded = LightSource(315, 40).shade(z, colormaps["gist_earth"], blend_mode="soft", **span)
+    axis.imshow(shaded, origin="lower", extent=(0, length, -width / 2, width / 2))
     for person in terrain.people:
-        axis.plot(*person.path.T, color="tab:orange", lw=0.8)
-    axis.plot(*terrain.starts[:, :2].T, "wo", ms=4, mec="k")
-    axis.plot(*terrain.goals[:, :2].T, "o", color="tab:green", ms=4, mec="k")
+        axis.plot(*person.path.T, color="tab:orange", lw=1)
+    axis.plot(*terrain.starts[:, :2].T, "wo", ms=5, mec="k")
+    axis.plot(*terrain.goals[:, :2].T, "o", color="tab:green", ms=5, mec="k")
     axis.set(xticks=[], yticks=[])
 
 
 def play(args):
-    """`play`: one episode in PyBullet's window, or as a GIF and a picture of the path."""
-    act, options, _ = load_actor(args.policy)
-    place = (args.mesh, args.scale, args.up) if args.mesh else args.world
-    terrain = make_place(place, args.seed)
-    if not args.gui:  # what is not installed or cannot be written is named before the work
-        from matplotlib.figure import Figure  # not pyplot: it needs no display
+    """`play`: one episode in PyBullet's window, or as a GIF."""
+    load_actor(args.policy)  # what is wrong is named before the work
+    place = load_scan(args.scan, args.scale, args.up) if args.scan else args.world
+    options = {"gui": True} if args.gui else {"render_mode": "rgb_array"}
+    if not args.gui:
         from PIL import Image
 
-        Path(args.gif).open("a").close()
-    options |= {"gui": True} if args.gui else {"render_mode": "rgb_array"}
-    env = make_env(terrain, max_episode_steps=round(EVAL_SECONDS / DT), **options)
-    robot = env.unwrapped
-    robot.show_lidar = args.lidar
-    observation, info = env.reset(seed=args.seed)
-    frames, path, terminated, truncated = [], [], False, False
+        check_writable(args.gif)
+    frames, path = [], []
     with tqdm(total=EVAL_SECONDS, unit="s", bar_format="{l_bar}{bar}|{n:.0f}/{total} s") as bar:
-        while not (terminated or truncated):
+        for env, info in episode(args.policy, place, args.seed, **options):  # noqa: B007
             if args.gui:
-                robot.bullet.resetDebugVisualizerCamera(2.4, robot.view_yaw, -40, robot.position)
-                time.sleep(DT)
+                env.simulation.bullet.resetDebugVisualizerCamera(
+                    2.4, math.degrees(env.robot.yaw) - 90, -40, env.robot.position)
+                time.sleep(DT * HOLD)
             elif len(path) % GIF_EVERY == 0:
                 frames.append(env.render())
-            path.append(robot.position - robot.origin)
-            observation, _, terminated, truncated, info = env.step(act(observation, env))
-            bar.update(DT)
+            path.append(env.robot.position)
+            bar.update(min(env.seconds, EVAL_SECONDS) - bar.n)
     end = "reached the goal" if info["success"] else "fell" if info["fall"] else "ran out of time"
-    print(f"{terrain.name}: t_cr {info['t_cr']:.2f}, {end} after {len(path) * DT:.1f} s")
+    print(f"{info['task']}: t_cr {info['t_cr']:.2f}, {end} after {env.seconds:.1f} s")
     if not args.gui:
         some = frames[:: -(len(frames) // 8 + 1)]  # the last one among them: it shows the goal
         palette = Image.fromarray(np.concatenate(some)).quantize(64)
         pictures = [Image.fromarray(frame).quantize(palette=palette, dither=0) for frame in frames]
         pictures[0].save(args.gif, save_all=True, append_images=pictures[1:], loop=0,
-                         duration=round(1000 * GIF_EVERY * DT))
-        figure = Figure(figsize=(6, 5), layout="constrained")
-        axis = figure.subplots()
-        draw_map(axis, terrain)
-        axis.plot(*np.array(path)[:, :2].T, color="tab:red")
-        axis.set_title(f"{terrain.name}, seed {args.seed}: {end}, t_cr {info['t_cr']:.2f}")
-        picture = Path(args.gif).with_suffix(".png")
-        figure.savefig(picture, dpi=100)
-        print(f"{args.gif}  {picture}")
-    env.close()
+                         duration=round(1000 * GIF_EVERY * HOLD * DT))
+        print(args.gif)
     return 0
 
 
@@ -1059,17 +881,16 @@ def gallery(args):
     """`gallery`: every training task and every unseen world from above, in one picture."""
     from matplotlib.figure import Figure
 
-    Path(args.out).open("a").close()  # as in play
-    figure = Figure(figsize=(15, 11), layout="constrained")
+    check_writable(args.out)
     names = [*PILLAR_TASKS, *WORLDS]
-    axes = figure.subplots(-(-len(names) // 7), 7).ravel()
+    figure = Figure(figsize=(15, 11), layout="constrained")
+    axes = figure.subplots(-(-len(names) // 6), 6).ravel()
     for axis in axes[len(names) :]:
         axis.remove()
     for axis, name in zip(axes, tqdm(names, unit="terrain"), strict=False):
-        rng = np.random.default_rng(args.seed)
-        unseen = name in WORLDS
+        rng, unseen = np.random.default_rng(args.seed), name in WORLDS
         draw_map(axis, make_world(name, args.seed) if unseen else make_terrain(name, rng, 0.8))
-        axis.set_title(name, color="tab:red" if unseen else "k", fontsize=11)
+        axis.set_title(name, color="tab:red" if unseen else "k", fontsize=13)
     figure.savefig(args.out, dpi=75)
     print(args.out)
     return 0
@@ -1087,11 +908,11 @@ def _names(valid, what, text):
 
 
 def _whole(least, text):
-    with contextlib.suppress(ValueError, OverflowError):
-        value = int(float(text))
-        if value == float(text) >= least:
-            return value
-    raise argparse.ArgumentTypeError(f"must be a whole number of at least {least}, got {text!r}")
+    number = int(text) if text.isascii() and text.isdigit() else -1
+    if not least <= number < 2**53:
+        raise argparse.ArgumentTypeError(
+            f"must be a whole number from {least} to {2**53 - 1}, got {text!r}")
+    return number
 
 
 def _file(suffix, text):
@@ -1100,84 +921,79 @@ def _file(suffix, text):
     return text
 
 
-def mesh_options(p):
-    p.add_argument("--mesh", metavar="FILE.obj", help="a scanned building instead")
-    p.add_argument("--scale", type=float, default=1.0, help="of the mesh, metres a unit")
-    p.add_argument("--up", choices=("z", "y"), default="z", help="axis of the mesh that points up")
-
-
 def parse(argv):
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     parser = argparse.ArgumentParser("loco_mtrl.py", description=__doc__.split("\n")[0])
     commands = parser.add_subparsers(dest="command")
-    places = partial(_names, [*WORLDS, *PILLAR_TASKS], "world")
-    natural, positive = partial(_whole, 0), partial(_whole, 1)
+    places = functools.partial(_names, [*WORLDS, *PILLAR_TASKS], "world")
+    natural, positive = functools.partial(_whole, 0), functools.partial(_whole, 1)
+    ranks = dict(type=positive, default=cores, help="processes; default: every core")
 
     p = commands.add_parser("train", help="train a policy")
-    p.add_argument("--steps", type=positive, default=MAIN_STEPS, help="of the environment, in all")
-    p.add_argument("--tasks", type=partial(_names, PILLAR_TASKS, "task"),
-                   default=list(PILLAR_TASKS), help="comma-separated; default: all %(default)s")
+    p.add_argument("--steps", type=positive, default=PPOConfig.total_timesteps,
+                   help="decisions of the policy, in all (default %(default)s)")
+    p.add_argument("--tasks", type=functools.partial(_names, PILLAR_TASKS, "task"), metavar="TASKS",
+                   default=list(PILLAR_TASKS), help=f"default: all of {', '.join(PILLAR_TASKS)}")
     p.add_argument("--no-tg", dest="tg", action="store_false", help="reactive policy")
     p.add_argument("--no-lidar", dest="lidar", action="store_false", help="blind policy")
-    p.add_argument("--paper", type=partial(_names, OURS, "part"), nargs="?", const=list(OURS),
-                   default=[], metavar="PARTS",
-                   help="state and training as in the paper, without what is ours: a guide who "
-                   "shows the way in training, and the robot's map; or only without those named "
-                   f"({','.join(OURS)})")
     p.add_argument("--sequential", action="store_true", help="one task after the other, not mixed")
     p.add_argument("--seed", type=natural, default=0)
     p.add_argument("--run-dir", default="runs/main", help="(default %(default)s)")
     p.add_argument("--resume", action="store_true", help="go on from the run's checkpoint")
     p.add_argument("--tensorboard", action="store_true", help="log for TensorBoard, too")
-    p.add_argument("--ranks", type=positive, default=cores, help="processes; default: every core")
-    p.add_argument("--stage", type=natural, help=argparse.SUPPRESS)  # see launch
+    p.add_argument("--ranks", **ranks)
     p.set_defaults(run=train)
 
-    p = commands.add_parser("eval", help="score policies in worlds they never saw")
+    scan = argparse.ArgumentParser(add_help=False)
+    scan.add_argument("--scan", metavar="FILE", help="a scanned building instead")
+    scan.add_argument("--scale", type=float, default=1.0, help="of the scan, metres a unit")
+    scan.add_argument("--up", choices=("z", "y"), default="z", help="axis of the scan that is up")
+
+    p = commands.add_parser("eval", parents=[scan], help="score policies in unseen worlds")
     p.add_argument("policies", nargs="+", metavar="POLICY",
                    help=f"a .pt file, or a reference: {', '.join(REFERENCES)}")
-    p.add_argument("--worlds", type=places, default=list(WORLDS),
+    p.add_argument("--worlds", type=places, default=list(WORLDS), metavar="WORLDS",
                    help="comma-separated worlds, or training tasks on held-out seeds")
-    mesh_options(p)
     p.add_argument("--episodes", type=positive, default=20, help="per world (default %(default)s)")
     p.add_argument("--json", metavar="FILE", help="write the scores there, too")
-    p.add_argument("--ranks", type=positive, default=cores, help="processes; default: every core")
+    p.add_argument("--ranks", **ranks)
     p.set_defaults(run=eval_command)
 
-    p = commands.add_parser("play", help="watch a policy for one episode")
+    p = commands.add_parser("play", parents=[scan], help="watch a policy for one episode")
     p.add_argument("policy", metavar="POLICY", help="as in eval")
     p.add_argument("--world", choices=[*WORLDS, *PILLAR_TASKS], metavar="WORLD", default="maze",
                    help="a world or a training task (default %(default)s)")
-    mesh_options(p)
     p.add_argument("--seed", type=natural, default=EVAL_SEED, help="layout (default %(default)s)")
-    p.add_argument("--gif", type=partial(_file, ".gif"), metavar="FILE.gif", default="play.gif",
-                   help="(default %(default)s)")
-    p.add_argument("--lidar", action="store_true", help="draw where the LiDAR's rays hit")
+    p.add_argument("--gif", type=functools.partial(_file, ".gif"), metavar="FILE.gif",
+                   default="play.gif", help="(default %(default)s)")
     p.add_argument("--gui", action="store_true", help="PyBullet's window instead of a GIF")
     p.set_defaults(run=play)
 
     p = commands.add_parser("gallery", help="draw all terrains in one picture")
-    p.add_argument("--out", type=partial(_file, ".png"), metavar="FILE.png", default="gallery.png",
-                   help="(default %(default)s)")
+    p.add_argument("--out", type=functools.partial(_file, ".png"), metavar="FILE.png",
+                   default="gallery.png", help="(default %(default)s)")
     p.add_argument("--seed", type=natural, default=0)
     p.set_defaults(run=gallery)
 
-    args = parser.parse_args(argv)
-    args.argv = argv[:-2] if getattr(args, "stage", None) is not None else argv
+    args = parser.parse_args(argv or ["train"])
+    args.argv = argv
     return args
 
 
 def main(argv=None):
     argv = sys.argv[1:] if argv is None else argv
-    args = parse(argv or ["train"])
+    args = parse(argv)
     try:
         code = args.run(args)
-        if not argv and not code:  # the main job: train, then score
+        if not argv and not code and "RANK" not in os.environ:  # the main job: train, then score
             code = eval_command(parse(["eval", str(Path(args.run_dir) / "policy.pt")]))
         return code
-    except (ValueError, OSError, ImportError, FloatingPointError) as error:
+    except (ValueError, OSError, ImportError, ArithmeticError, RuntimeError) as error:
         print(f"loco_mtrl.py: error: {error}", file=sys.stderr)
-        return LOST if isinstance(error, ConnectionError) else 2
+        return 2
+    except KeyboardInterrupt:
+        print("\nStopped.", file=sys.stderr)
+        return 130
 
 
 if __name__ == "__main__":

@@ -1,279 +1,489 @@
 """Whatever stops a training, wherever it is: the last checkpoint is whole, and resuming goes on."""
 
-import csv
-import json
+import contextlib
+import io
 import os
+import re
 import resource
+import select
 import signal
 import socket
-import subprocess
 import sys
+import time
+from argparse import Namespace
 from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
 import psutil
 import pytest
 import torch
-from test_ppo import SMALL, Probe, same_bits, states
+from test_ppo import Probe, same_bits, states, table
+from torch.distributed.launcher.api import LaunchConfig, elastic_launch
 
 import loco_mtrl
 import ppo
 
 ROOT = Path(loco_mtrl.__file__).parent
+TINY = {"num_envs": 2, "num_steps": 8, "num_minibatches": 2, "hidden": (8,), "checkpoint_every": 1}
+UPDATE = 2 * 7  # rows: 8 steps of 2 envs, whose 6th is a reset
 
 
-def train(folder, updates, resume=False, **options):
-    """A small training that saves after every update, of 4 x 32 rows with some resets in them."""
-    config = ppo.PPOConfig(total_timesteps=updates * 120, checkpoint_every=1, **SMALL)
-    env = lambda index: Probe(lambda obs, action, t: obs[0] * action, length=20)  # noqa: E731
-    return ppo.learn(env, config, run_dir=folder, resume=resume, episode_keys=(), **options)
+class Stop(Exception):
+    pass
+
+
+@pytest.fixture(autouse=True)
+def no_curve(monkeypatch):
+    """As where matplotlib is not installed: a picture after every update takes most of the time."""
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+
+
+def train(folder, stop=None, resume=False, total=3, env=Probe, changes=None, **options):
+    """A training of `total` updates that saves after each, or of `stop`; returns the states."""
+    config = ppo.PPOConfig(**TINY | (changes or {}), total_timesteps=total * UPDATE)
+
+    def on_update(model, row):
+        if row["update"] == stop:
+            raise Stop
+
+    options = {"on_update": on_update, "meta": {"a": 1}} | options
+    make = lambda index, leg: env(lambda obs, action, t: obs[0] * action, length=5)  # noqa: E731
+    try:
+        return states(ppo.learn(make, config, run_dir=folder, resume=resume, **options)[0])
+    except Stop:
+        return None
+
+
+def go_on(folder, **options):
+    """What a person does after a crash: resumes or, before the first checkpoint, starts again."""
+    return train(folder, resume=(folder / "checkpoint.pt").exists(), **options)
+
+
+@pytest.fixture(scope="module")
+def unbroken(tmp_path_factory):
+    """Parameters after three updates that nothing has stopped."""
+    return train(tmp_path_factory.mktemp("unbroken"))
+
+
+def content(folder):
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
 def in_a_child(function):
-    """Runs `function` in a process of its own; returns the signal that ended it, or 0."""
-    child = os.fork()
-    if not child:
-        try:
-            function()
-        finally:
-            os._exit(0)
-    return os.WTERMSIG(os.waitpid(child, 0)[1])
+    """Runs `function` in a process of its own; returns its exit code, -9 if it was killed."""
+    child = get_context("fork").Process(target=function)
+    child.start()
+    child.join(60)
+    child.kill()
+    child.join()
+    return child.exitcode
 
 
 def die(*_, **__):
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-# ---------------------------------------------------------------- killed while it saves
+# ---------------------------------------------------------------- killed, wherever it is
 
 
-class Dying:
+WRITERS = [function.__code__ for function in (
+    ppo.RunFolder.__init__, ppo.RunFolder._drop_rows_after, ppo.RunFolder.log, ppo.RunFolder.save,
+    ppo.write_whole)]
+
+
+@pytest.mark.parametrize("stop", [None, 1], ids=["fresh", "resumed"])
+def test_killed_before_any_line_that_writes(stop, tmp_path, unbroken):
+    """Before every third line, from the first that opens the folder to the last save."""
+    def trace(frame, event, _):
+        nonlocal left
+        left -= event == "line" and frame.f_code in WRITERS
+        if not left:
+            die()
+        return trace if frame.f_code in WRITERS else None
+
+    def doomed():
+        sys.settrace(trace)
+        go_on(folder, stop=2)
+
+    for moment in range(1 + bool(stop), 99, 3):
+        folder, left = tmp_path / str(moment), moment
+        if stop:
+            train(folder, stop=stop)
+        code = in_a_child(doomed)
+        assert same_bits(go_on(folder), unbroken)
+        assert [row["update"] for row in table(folder)] == ["1", "2", "3"]
+        if code == 0:  # it came to its end
+            break
+        assert code == -9
+    assert 30 < moment < 90
+
+
+class Dying(io.FileIO):
     """A file whose disk takes `left` bytes, and then the process is killed."""
 
-    def __init__(self, path, mode, left):
-        self.file, self.left = open(path, mode, buffering=0), left
-
     def write(self, data):
-        self.file.write(bytes(data)[: self.left])
+        super().write(bytes(data)[: self.left])
         self.left -= len(data)
         if self.left <= 0:
             die()
         return len(data)
 
-    def __getattr__(self, name):
-        return getattr(self.file, name)
 
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
-        self.file.close()
-
-
-@pytest.fixture(scope="module")
-def run_of_two(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("run")
-    train(folder, 2)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def unbroken(tmp_path_factory):
-    """Parameters after four updates that nothing has stopped."""
-    return states(train(tmp_path_factory.mktemp("unbroken"), 4))
-
-
-MOMENTS = [*np.random.default_rng(0).uniform(0, 1, 17).round(3).tolist(), "fsync", "replace", "end"]
-
-
-@pytest.mark.parametrize("moment", MOMENTS)
-def test_killed_while_saving(moment, tmp_path, run_of_two, unbroken, monkeypatch):
-    for file in run_of_two.iterdir():
-        (tmp_path / file.name).write_bytes(file.read_bytes())
-    size = (tmp_path / "checkpoint.pt").stat().st_size
-
-    def third_update():
-        if moment in ("fsync", "replace"):
-            monkeypatch.setattr(os, moment, die)
-        elif moment == "end":
-            replace = os.replace
-            monkeypatch.setattr(os, "replace", lambda *names: (replace(*names), die()))
-        else:
-            dying = lambda path, mode="r", **how: (  # noqa: E731
-                Dying(path, mode, round(moment * size)) if mode == "wb"
-                else open(path, mode, **how)
-            )
-            monkeypatch.setattr(ppo, "open", dying, raising=False)
-        train(tmp_path, 3, resume=True)
-
-    assert in_a_child(third_update) == signal.SIGKILL
-    counters = ppo.load_checkpoint(tmp_path / "checkpoint.pt")["counters"]
-    assert counters["update"] == (3 if moment == "end" else 2)
-    resumed = train(tmp_path, 4, resume=True)
-    assert same_bits(states(resumed), unbroken)
-
-
-@pytest.mark.parametrize("full", ["checkpoint.pt.tmp", "progress.csv"])
-def test_a_full_disk_leaves_the_last_checkpoint(full, tmp_path, unbroken):
-    train(tmp_path, 2)
+@pytest.mark.parametrize("share", [0.0, 0.03, 0.4, 0.8, 0.999])
+@pytest.mark.parametrize("saved", [0, 1])
+def test_killed_in_the_midst_of_a_checkpoint(share, saved, tmp_path, unbroken, monkeypatch):
+    train(tmp_path, stop=1)
     before = (tmp_path / "checkpoint.pt").read_bytes()
-    if full == "progress.csv":
-        size = (tmp_path / full).stat().st_size
-        limit = resource.getrlimit(resource.RLIMIT_FSIZE)
-        resource.setrlimit(resource.RLIMIT_FSIZE, (size, limit[1]))
-    else:
-        (tmp_path / full).symlink_to("/dev/full")
-    try:
-        with pytest.raises(OSError, match="No space left|File too large"):
-            train(tmp_path, 3, resume=True)
-    finally:
-        if full == "progress.csv":
-            resource.setrlimit(resource.RLIMIT_FSIZE, limit)
+    if not saved:
+        (tmp_path / "checkpoint.pt").unlink()
+
+    def open_(path, mode="r", **how):
+        file = Dying(path, mode) if mode == "wb" else open(path, mode, **how)
+        file.left = round(share * len(before))
+        return file
+
+    with monkeypatch.context() as patch:
+        patch.setattr(ppo, "open", open_, raising=False)
+        assert in_a_child(lambda: go_on(tmp_path)) == -9
+    assert saved == (tmp_path / "checkpoint.pt").exists()
+    assert not saved or (tmp_path / "checkpoint.pt").read_bytes() == before
+    assert same_bits(go_on(tmp_path), unbroken)
+
+
+@pytest.mark.parametrize("room", [100, 1000, 9000])  # not enough for any file, the last, all of it
+def test_a_full_disk_leaves_the_last_checkpoint(room, tmp_path, unbroken):
+    def full():
+        sys.stderr = open(os.devnull, "w")  # or pytest's own file would be full, too
+        resource.setrlimit(resource.RLIMIT_FSIZE, (room, room))
+        with pytest.raises(OSError, match="File too large"):
+            train(tmp_path, resume=True)
+
+    train(tmp_path, stop=1)
+    before = (tmp_path / "checkpoint.pt").read_bytes()
+    assert in_a_child(full) == 0 and len(before) > 9000
     assert (tmp_path / "checkpoint.pt").read_bytes() == before
-    (tmp_path / "checkpoint.pt.tmp").unlink(missing_ok=True)
-    assert same_bits(states(train(tmp_path, 4, resume=True)), unbroken)
+    assert same_bits(train(tmp_path, resume=True), unbroken)
 
 
-def test_a_second_ctrl_c_stops_at_once_and_the_last_checkpoint_is_whole(tmp_path):
+@pytest.mark.parametrize(("damage", "left"), [
+    (lambda text: None, [2, 3]), (lambda text: "", [2, 3]), (lambda text: text[:7], [2, 3]),
+    (lambda text: text[:-9], [2, 3]), (lambda text: text.splitlines()[0], [2, 3]),
+    (lambda text: text + text.splitlines()[1][:20], [1, 2, 3]),
+    (lambda text: text + "2,999\n3,1", [1, 2, 3]),
+], ids=["none", "empty", "half a header", "half a row", "header", "one and a half", "later rows"])
+def test_a_damaged_table_stops_no_resume(damage, left, tmp_path, unbroken):
+    train(tmp_path, stop=1)
+    text = damage((tmp_path / "progress.csv").read_text())
+    (tmp_path / "progress.csv").unlink()
+    if text is not None:
+        (tmp_path / "progress.csv").write_text(text)
+    assert same_bits(train(tmp_path, resume=True), unbroken)
+    rows = table(tmp_path)
+    assert [int(row["update"]) for row in rows] == left
+    assert [int(row["steps"]) for row in rows] == [UPDATE * update for update in left]
+
+
+# ---------------------------------------------------------------- stopped and resumed
+
+
+def test_legs_in_turn_make_the_run_in_one_piece(tmp_path, unbroken):
+    seen, model, leg = [], None, lambda steps: ("leg", steps // UPDATE)
+    config = ppo.PPOConfig(total_timesteps=3 * UPDATE, **TINY)
+
+    def make(index, leg):
+        seen.append((index, leg))
+        return Probe(lambda obs, action, t: obs[0] * action, length=5)
+
+    for number in range(3):
+        model, steps = ppo.learn(make, config, run_dir=tmp_path, resume=number > 0, leg=leg)
+        assert steps == (number + 1) * UPDATE
+    assert same_bits(states(model), unbroken)
+    assert seen == [(index, ("leg", number)) for number in range(3) for index in range(2)]
+
+
+def test_a_run_is_not_opened_twice(tmp_path):
+    """Neither before its first checkpoint nor after it, and nothing is touched."""
+    def refused(resume):
+        before = content(tmp_path)
+        with pytest.raises(BlockingIOError, match="another process is training in"):
+            train(tmp_path, resume=resume)
+        assert content(tmp_path) == before
+        tries.append(resume)
+
+    class Nosy(Probe):
+        def __init__(self, *args, **options):
+            super().__init__(*args, **options)
+            refused(False)
+
+    tries = []
+    train(tmp_path, total=1, env=Nosy, on_update=lambda *_: refused(True))
+    assert tries == [False] * 2 + [True]
+
+
+def test_a_failed_training_lets_its_folder_go(tmp_path, unbroken):
+    def fail(*_):
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError) as kept:  # its traceback still knows all of `learn`
+        train(tmp_path, on_update=fail)
+    assert same_bits(train(tmp_path, resume=True), unbroken) and kept
+
+
+def test_what_does_not_fit_is_refused_before_anything_is_touched(tmp_path):
+    train(tmp_path, stop=1)
+    before = content(tmp_path)
+    for kind, named, options in (
+            (FileExistsError, "already holds a run", {}),
+            (ValueError, r"holds another run: \{'a': 1\}", {"resume": True, "meta": {"a": 2}}),
+            (TypeError, "JSON", {"resume": True, "meta": {"a": 1j}})):
+        with pytest.raises(kind, match=named):
+            train(tmp_path, **options)
+        assert content(tmp_path) == before
+    with pytest.raises(ValueError, match=r"network is .*\[8\].* asked for is .*\[9\]"):
+        train(tmp_path, resume=True, changes={"hidden": (9,)})
+    model, _ = ppo.load_policy(tmp_path / "checkpoint.pt")
+    ppo.save_policy(tmp_path / "checkpoint.pt", model, {"a": 1})
+    with pytest.raises(ValueError, match="holds another run"):  # a policy is no checkpoint
+        train(tmp_path, resume=True)
+    with pytest.raises(FileNotFoundError, match="no checkpoint"):
+        train(tmp_path / "new", resume=True)
+    assert not (tmp_path / "new").exists()
+
+
+def test_ctrl_c_finishes_the_update_and_keeps_it(tmp_path, unbroken):
+    def interrupt(model, row):
+        if row["update"] == 1:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt):
+        train(tmp_path, on_update=interrupt)
+    assert signal.getsignal(signal.SIGINT) is before
+    assert ppo.load_checkpoint(tmp_path / "checkpoint.pt")["counters"][:2] == (2, 2 * UPDATE)
+    assert len(table(tmp_path)) == 2
+    assert same_bits(train(tmp_path, resume=True), unbroken)
+
+
+def test_a_second_ctrl_c_stops_at_once_and_the_last_checkpoint_is_whole(tmp_path, unbroken):
     class Impatient(Probe):
         def step(self, action):
-            for _ in range(2 * (signals.count(True) == 300)):
+            steps.append(action)
+            if len(steps) == 2 * UPDATE + 5:  # in the third update
                 os.kill(os.getpid(), signal.SIGINT)
-            signals.append(True)
+                os.kill(os.getpid(), signal.SIGINT)
             return super().step(action)
 
-    signals = []
-    config = ppo.PPOConfig(total_timesteps=9999, checkpoint_every=1, **SMALL)
+    steps = []
     with pytest.raises(KeyboardInterrupt):
-        ppo.learn(lambda index: Impatient(), config, run_dir=tmp_path, episode_keys=())
-    assert len(signals) == 300  # in the third update, of 128 steps and resets each
-    assert ppo.load_checkpoint(tmp_path / "checkpoint.pt")["counters"]["update"] < 5
+        train(tmp_path, env=Impatient)
+    assert len(steps) == 2 * UPDATE + 5
+    assert ppo.load_checkpoint(tmp_path / "checkpoint.pt")["counters"][0] == 2
+    assert same_bits(train(tmp_path, resume=True), unbroken)
 
 
-# ---------------------------------------------------------------- killed ranks, lost machines
+# ---------------------------------------------------------------- many processes
+
+started = []
 
 
-@pytest.mark.parametrize("victims", ["one rank", "all ranks"])
-def test_killed_ranks_stop_the_training_with_one_message(victims, tmp_path):
-    command = [sys.executable, str(ROOT / "loco_mtrl.py"), "train", "--tasks", "flat", "--ranks",
-               "2", "--run-dir", str(tmp_path / "run")]  # fmt: skip
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-    bars = ""
-    while "t_cr" not in bars:  # the bar names it after every update
-        bars += process.stdout.read(20) or pytest.fail(bars)
-    ranks = psutil.Process(process.pid).children()
-    for rank in ranks[: 1 if victims == "one rank" else 2]:
-        rank.kill()
-    text, _ = process.communicate(timeout=30)
-    assert process.returncode == 1
-    assert "killed by signal 9" in text.splitlines()[-1] and "Traceback" not in text
-    assert not any(rank.is_running() for rank in ranks)
+@pytest.fixture(scope="module", autouse=True)
+def no_orphans():
+    """Even where a test has failed."""
+    yield
+    for process in started:
+        with contextlib.suppress(psutil.NoSuchProcess):
+            for child in psutil.Process(process.pid).children(recursive=True):
+                child.kill()
+        process.kill()
 
 
-AGENT = """
+def start(main, **environment):
+    """Forks a process for main(); returns it, and the pipe of all that it and its children say."""
+    reader, writer = os.pipe()
+
+    def child():
+        os.environ.update(environment, OMP_NUM_THREADS="1", PYTHONPATH=str(ROOT))
+        os.dup2(writer, 1), os.dup2(writer, 2), os.close(writer)
+        sys.stdout = sys.stderr = open(2, "w", buffering=1, closefd=False)
+        sys.exit(main())
+
+    process = get_context("fork").Process(target=child)
+    process.start()
+    os.close(writer)
+    started.append(process)
+    return process, reader
+
+
+def read(process, until=None, seconds=200):
+    """What the process says until a word, or until it and all its children are gone."""
+    (process, reader), end, text = process, time.monotonic() + seconds, b""
+    while until is None or until.encode() not in text:
+        if not select.select([reader], [], [], end - time.monotonic())[0]:
+            pytest.fail(f"still running after {seconds} s: {text.decode()}")
+        if not (said := os.read(reader, 4096)):
+            process.join()
+            os.close(reader)
+            assert until is None, text
+            break
+        text += said
+    return text.decode()
+
+
+JOB = """
 import os, sys
-from pathlib import Path
-from test_faults import train
-from test_ppo import states
-import torch
-folder, rank = Path(sys.argv[1]), os.environ["RANK"]
-first = os.environ["TORCHELASTIC_RESTART_COUNT"] == "0"
-def fault(model, row):
-    if sys.argv[2] == "crash" and first and row["update"] == 3:
-        os.kill(os.getpid(), 9)
-    if row["update"] == 2:
-        print("two updates", flush=True)
-model = train(folder / "run", int(sys.argv[3]), resume=not first, on_update=fault)
-torch.save(states(model), folder / f"rank{rank}.pt")
-if sys.argv[2] == "whole" and os.path.exists("/proc"):  # does closing the group end its threads?
-    torch.distributed.destroy_process_group()
-    threads = [file.read_text() for file in Path("/proc/self/task").glob("*/comm")]
-    assert not any("gloo" in name for name in threads), threads
+from dataclasses import dataclass
+import loco_mtrl
+
+@dataclass(frozen=True)
+class Tiny(loco_mtrl.PPOConfig):
+    num_envs: int = 2
+    num_steps: int = 8
+    num_minibatches: int = 2
+
+sys.modules["matplotlib.figure"] = None
+loco_mtrl.PPOConfig, loco_mtrl.LAYOUTS, loco_mtrl.LEG = Tiny, 1, int(os.environ["LEG"])
+print("rank", os.getpid(), flush=True)
+sys.exit(loco_mtrl.main())
 """
 
 
-def agents(folder, count, *arguments, restarts=0):
-    """Starts `count` torchrun agents that share four ranks and a rendezvous on this machine."""
-    folder.mkdir()
-    (folder / "agent.py").write_text(AGENT)
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    command = [sys.executable, "-m", "torch.distributed.run", "--nnodes", str(count),
-               "--nproc-per-node", str(4 // count), "--max-restarts", str(restarts),
-               "--rdzv-backend", "c10d", "--rdzv-endpoint", f"127.0.0.1:{port}",
-               str(folder / "agent.py"), str(folder), *map(str, arguments)]  # fmt: skip
-    paths = f"{ROOT}{os.pathsep}{ROOT / 'tests'}"
-    environment = os.environ | {"PYTHONPATH": paths, "OMP_NUM_THREADS": "1"}
-    return [subprocess.Popen(command, env=environment, text=True, stdout=subprocess.PIPE,
-                             stderr=subprocess.STDOUT) for _ in range(count)]  # fmt: skip
+@pytest.fixture
+def job(tmp_path, monkeypatch):
+    """Starts the command line for a tiny training of two ranks, with another length of a leg."""
+    def begin(leg, *arguments):
+        command = ["train", "--tasks", "flat", "--no-lidar", "--ranks", "2", "--run-dir",
+                   str(tmp_path / "run"), *map(str, arguments)]
+        return start(lambda: loco_mtrl.main(command), LEG=str(leg))
+
+    (tmp_path / "job.py").write_text(JOB)
+    monkeypatch.setattr(loco_mtrl, "__file__", str(tmp_path / "job.py"))
+    return begin
 
 
-def test_two_agents_train_what_one_does(tmp_path):
-    ends = []
-    for name, count in (("one", 1), ("two", 2)):
-        processes = agents(tmp_path / name, count, "whole", 3)
-        for process in processes:
-            text, _ = process.communicate(timeout=120)
-            assert process.returncode == 0, text
-        ends.append([torch.load(tmp_path / name / f"rank{rank}.pt") for rank in range(4)])
-    for state in [*ends[0], *ends[1]]:
-        assert same_bits(state, ends[0][0])
+def test_after_each_leg_every_process_starts_itself_afresh(job, tmp_path):
+    process = job(40, "--steps", 64)  # of 16 steps each: three updates, and one
+    text = read(process)
+    assert process[0].exitcode == 0 and "policy.pt" in text, text
+    ranks = re.findall(r"rank (\d+)\n", text)
+    assert len(ranks) == 4 and len(set(ranks)) == 2, text
+    assert [row["steps"] for row in table(tmp_path / "run")] == ["16", "32", "48", "64"]
 
 
-def test_a_crash_under_max_restarts_goes_on_from_the_checkpoint(tmp_path):
-    (process,) = agents(tmp_path / "a", 1, "crash", 9, restarts=1)
-    text, _ = process.communicate(timeout=120)
-    assert process.returncode == 0, text
-    with open(tmp_path / "a" / "run" / "progress.csv", newline="") as file:
-        updates = [int(row["update"]) for row in csv.DictReader(file)]
-    assert updates == list(range(1, len(updates) + 1)) and len(updates) >= 3
+def test_a_killed_rank_ends_the_training_with_one_message(job, tmp_path):
+    process = job(10**9)
+    read(process, until="32/")  # two updates
+    ranks = psutil.Process(process[0].pid).children()
+    ranks[1].kill()
+    text = read(process)  # to its end: nobody is left that could write
+    assert not any(rank.is_running() for rank in ranks)
+    assert process[0].exitcode == 2, text
+    assert "rank 1 was killed by signal 9. To go on" in text.splitlines()[-1]
+    assert text.splitlines()[-1].endswith(f"--run-dir {tmp_path / 'run'} --resume")
+    assert "Traceback" not in text
+    assert ppo.load_checkpoint(tmp_path / "run" / "checkpoint.pt")["counters"][0] >= 1
 
 
-def test_a_lost_agent_ends_the_other(tmp_path):
-    one, two = agents(tmp_path / "a", 2, "endless", 10**6)
-    line = ""
-    while "two updates" not in line:
-        line = one.stdout.readline() or two.stdout.readline() or pytest.fail("no update")
-    for process in [*psutil.Process(two.pid).children(), psutil.Process(two.pid)]:
-        process.kill()
-    text, _ = one.communicate(timeout=30)
-    two.communicate()
-    assert one.returncode != 0 and "another rank was lost" in text
+def test_killed_ranks_are_all_named(tmp_path, monkeypatch, capsys):
+    (tmp_path / "job.py").write_text("import os; os.kill(os.getpid(), 9)")
+    monkeypatch.setattr(loco_mtrl, "__file__", str(tmp_path / "job.py"))
+    assert loco_mtrl.main(["train", "--ranks", "2"]) == 9
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 2 and all(
+        f"error: rank {k} was killed by signal 9" in line for k, line in enumerate(lines))
 
 
-# ---------------------------------------------------------------- the same twice, and for long
+@pytest.fixture(scope="module")
+def ranks_of_torchrun(tmp_path_factory, unbroken):
+    """States of four ranks that torchrun's agents start: of two agents, and of one, with a crash.
+
+    As `python -m torch.distributed.run` does, but forked, to spare the seconds that torch loads.
+    """
+    def main(folder, crashes):
+        again = os.environ["TORCHELASTIC_RESTART_COUNT"] != "0"
+
+        def on_update(model, row):
+            if crashes and not again and row["update"] == 2:
+                die()
+
+        model = train(folder / "run", total=3 * 2, changes={"num_envs": 4}, resume=again,
+                      on_update=on_update)
+        torch.save([model, again], folder / f"rank{os.environ['RANK']}.pt")
+
+    def all_ranks(agents, crashes):
+        folder = tmp_path_factory.mktemp("torchrun")
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            port = free.getsockname()[1]
+        config = LaunchConfig(
+            min_nodes=agents, max_nodes=agents, nproc_per_node=4 // agents, max_restarts=crashes,
+            rdzv_backend="c10d", rdzv_endpoint=f"127.0.0.1:{port}", run_id="test",
+            start_method="fork", monitor_interval=0.1)
+        for process in [start(lambda: elastic_launch(config, main)(folder, crashes) and 0)
+                        for _ in range(agents)]:
+            text = read(process)
+            assert process[0].exitcode == 0, text
+        assert [row["update"] for row in table(folder / "run")] == ["1", "2", "3"]
+        return [torch.load(folder / f"rank{rank}.pt") for rank in range(4)]
+
+    return all_ranks(2, 0), all_ranks(1, 1)
 
 
-def test_two_trainings_of_fifty_updates_are_equal(tmp_path):
-    ends = []
-    for name in "ab":
-        config = ppo.PPOConfig(num_envs=2, num_steps=16, total_timesteps=50 * 32 - 20,
-                               checkpoint_every=20, exteroceptive=(10, 16))  # fmt: skip
-        make = partial(loco_mtrl.training_env, seed=0, tasks=["stairs", "obstacles"])
-        ends.append(states(ppo.learn(make, config, run_dir=tmp_path / name)))
-        with open(tmp_path / name / "progress.csv", newline="") as file:
-            rows = list(csv.DictReader(file))
-        assert len(rows) >= 50
-        for row in rows:  # all but the clock
-            for key in ("minutes", "steps_per_s", "collect_s", "learn_s"):
-                del row[key]
-        (tmp_path / f"{name}.json").write_text(json.dumps(rows))
-    assert same_bits(*ends)
-    assert (tmp_path / "a.json").read_bytes() == (tmp_path / "b.json").read_bytes()
+def test_two_agents_train_what_one_does_that_crashes(ranks_of_torchrun):
+    """Under --max-restarts it goes on from its checkpoint."""
+    two, one = ranks_of_torchrun
+    for state, again in two:
+        assert same_bits(state, two[0][0]) and not again
+    for state, again in one:
+        assert same_bits(state, two[0][0]) and again
 
 
-def test_memory_stays_flat_over_twenty_thousand_episodes():
-    env = loco_mtrl.Map(loco_mtrl.LocoEnv(["flat", "stairs"]))
-    rng, process, sizes = np.random.default_rng(0), psutil.Process(), []
-    env.reset(seed=0)
-    actions = rng.normal(0, 0.3, (100, *env.action_space.shape))
-    for episode in range(20_000):
-        for k in range(3):
-            env.step(actions[(episode + k) % 100])
-        env.reset()
-        if episode in (2_000, 19_999):
+# ---------------------------------------------------------------- the robot
+
+
+def walk(folder, monkeypatch, stop=None, resume=False):
+    """Six updates of two robots with LiDAR and symmetry, in two legs."""
+    monkeypatch.setattr(loco_mtrl, "LAYOUTS", 1)
+    monkeypatch.setattr(loco_mtrl, "LEG", 128)
+    args = Namespace(tg=True, lidar=True, tasks=["stairs", "obstacles"], sequential=False, seed=0,
+                     steps=192)
+    config = ppo.PPOConfig(num_envs=2, num_steps=16, total_timesteps=192, checkpoint_every=2,
+                           n_scan=loco_mtrl.N_RAYS, num_minibatches=2, hidden=(16,))
+    mirror = tuple(map(loco_mtrl.mirror, (loco_mtrl.observation_parts(), loco_mtrl.action_parts())))
+
+    def on_update(model, row):
+        if row["update"] == stop:
+            raise Stop
+
+    steps = 0
+    while steps < 192:
+        model, steps = ppo.learn(
+            partial(loco_mtrl.training_env, args=args), config, run_dir=folder, mirror=mirror,
+            resume=resume or steps > 0, episode_keys=("t_cr",), groups=args.tasks,
+            leg=partial(loco_mtrl.leg_of, args=args), on_update=on_update)
+    return states(model)
+
+
+def test_a_robots_training_is_the_same_twice_and_after_a_stop(tmp_path, monkeypatch):
+    once, twice = (walk(tmp_path / name, monkeypatch) for name in "ab")
+    with pytest.raises(Stop):
+        walk(tmp_path / "c", monkeypatch, stop=3)  # one update after a checkpoint
+    assert same_bits(once, twice)
+    assert same_bits(once, walk(tmp_path / "c", monkeypatch, resume=True))
+    tables = [[{key: value for key, value in row.items() if key not in (
+        "minutes", "collect_s", "learn_s")} for row in table(tmp_path / name)] for name in "abc"]
+    assert tables[0] == tables[1] == tables[2] and len(tables[0]) == 6
+
+
+def test_memory_stays_flat_over_many_episodes():
+    env = loco_mtrl.LocoEnv(["flat", "stairs"], lidar=False)
+    process, sizes = psutil.Process(), []
+    action = np.full(env.action_space.shape, 0.3)
+    for episode in range(801):
+        env.reset(seed=episode if episode % 2 else None)
+        env.step(action)
+        if episode in (200, 800):
             sizes.append(process.memory_info().rss)
     env.close()
-    assert sizes[1] - sizes[0] < 8e6
+    assert sizes[1] - sizes[0] < 1e6

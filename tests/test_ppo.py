@@ -1,27 +1,26 @@
 """PPO against numbers worked out by hand, brute force, and environments whose answer is known."""
 
 import csv
+import json
 import math
 import os
 import pickle
-import signal
 import socket
-from functools import partial
+from multiprocessing import get_context
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-import torch.multiprocessing as mp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import ppo
-from ppo import ActorCritic, PPOConfig, compute_gae, learn, ppo_loss, ppo_update
+from ppo import ActorCritic, Collector, PPOConfig, compute_gae, learn, ppo_loss, with_images
 
 torch.set_num_threads(1)
 
-SMALL = {"num_envs": 4, "num_steps": 32, "encoder_hidden": (16,), "trunk_hidden": (16,)}
+SMALL = {"num_envs": 4, "num_steps": 32, "num_minibatches": 4, "hidden": (16,)}
 
 
 class Probe(gym.Env):
@@ -29,16 +28,18 @@ class Probe(gym.Env):
 
     observation_space = gym.spaces.Box(-1, 1, (2,), np.float32)
     action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+    seeds = []  # of all resets in this process
 
-    def __init__(self, reward=lambda obs, action, t: 1.0, length=1, truncates=False, blind=False):
-        self.reward, self.length, self.truncates, self.blind = reward, length, truncates, blind
+    def __init__(self, reward=lambda obs, action, t: 1.0, length=1, truncates=False, signs=(-1, 1)):
+        self.reward, self.length, self.truncates, self.signs = reward, length, truncates, signs
 
     def observe(self):
-        self.obs = self.np_random.choice([-1.0, 1.0], 2).astype(np.float32) * (not self.blind)
+        self.obs = self.np_random.choice(self.signs, 2).astype(np.float32)
         return self.obs
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
+        self.seeds.extend([] if seed is None else [seed])
         self.t = 0
         return self.observe(), {}
 
@@ -47,19 +48,20 @@ class Probe(gym.Env):
         reward = float(self.reward(self.obs, action[0], self.t))
         self.t += 1
         last = self.t >= self.length
-        info = {"t_cr": 0.5 + reward / 8, "task": "left" if self.obs[0] < 0 else "right"}
-        info |= {"success": 1.0} if self.obs[0] < 0 else {}  # others, that end with it, say nothing
+        info = {"t_cr": reward, "task": "left" if self.obs[0] < 0 else "right"}
         if self.length > 1:
             self.observe()
         return self.obs, reward, last and not self.truncates, last and self.truncates, info
 
 
-def train(env, updates, on_update=None, seed=0, **changes):
-    settings_ = {**SMALL, "critic_learning_rate": 1e-2, "learning_rate": 3e-3,
-                 "max_learning_rate": 1e-2, "target_kl": 0.05, "seed": seed, **changes}
-    rows = settings_["num_envs"] * settings_["num_steps"]
-    config = PPOConfig(total_timesteps=updates * rows // 2, **settings_)
-    return learn(lambda index: env(), config, episode_keys=(), on_update=on_update)
+def train(env, updates, **changes):
+    """A short training, with options of PPOConfig or of `learn`; returns the model."""
+    values = {**SMALL, "critic_learning_rate": 1e-2, "learning_rate": 1e-3, "max_advantage": 3.0,
+              "target_kl": (0.1, 0.02), **changes}
+    options = {name: values.pop(name) for name in ("mirror", "on_update") if name in values}
+    rows = values["num_envs"] * values["num_steps"]
+    config = PPOConfig(total_timesteps=updates * rows // 2, **values)
+    return learn(lambda index, leg: env(), config, **options)[0]
 
 
 def states(model):
@@ -70,6 +72,50 @@ def same_bits(a, b):
     return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
 
 
+def table(folder):
+    with open(folder / "progress.csv", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def in_ranks(world, function, seconds=60):
+    """Runs function(rank) in `world` forked ranks that meet each other; returns the exit codes."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+
+    def main(rank):
+        os.environ.update(RANK=str(rank), WORLD_SIZE=str(world), MASTER_ADDR="127.0.0.1",
+                          MASTER_PORT=str(port))
+        function(rank)
+
+    ranks = [get_context("fork").Process(target=main, args=(rank,)) for rank in range(world)]
+    for rank in ranks:
+        rank.start()
+    for rank in ranks:
+        rank.join(seconds)
+        rank.kill()
+        rank.join()
+    return [rank.exitcode for rank in ranks]
+
+
+# --- settings
+
+
+@pytest.mark.parametrize(("name", "value"), [
+    ("total_timesteps", 0), ("num_envs", -1), ("num_steps", 0), ("update_epochs", 0),
+    ("num_minibatches", 0), ("checkpoint_every", 0), ("gamma", 1.01), ("gamma", math.nan),
+    ("gae_lambda", -0.1), ("clip_coef", 0), ("max_advantage", 0.0), ("max_grad_norm", math.inf),
+    ("target_kl", (0.03, 0.0)), ("learning_rate", 0.0), ("critic_learning_rate", -1e-3),
+    ("init_std", -1), ("init_std", (0.1, 0.0)), ("init_std", ()), ("noise", (1.0, math.nan)),
+    ("n_scan", -1), ("hidden", ()), ("hidden", (64, 0)), ("seed", -1),
+])
+def test_bad_settings_are_named(name, value):
+    with pytest.raises(ValueError) as error:
+        PPOConfig(**{name: value})
+    assert f"{name} = {value!r}, but it must be from " in str(error.value)
+    PPOConfig(gamma=1, gae_lambda=0, n_scan=0, seed=10**15, init_std=(0.1, 0.2), hidden=(1,))
+
+
 # --- advantages
 
 
@@ -77,24 +123,23 @@ def column(*numbers, dtype=torch.float64):
     return torch.tensor(numbers, dtype=dtype)[:, None]
 
 
-def test_gae_by_hand():
-    # An episode that terminates at step 1, its reset row, then one that the rollout cuts at step 3.
-    rewards, values = column(1, 2, 0, 4), column(10, 20, 30, 40, 50)
-    flags = [column(*x, dtype=torch.bool) for x in ((0, 1, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0))]
-    advantages, returns = compute_gae(rewards, values, *flags, gamma=0.5, gae_lambda=0.5)
+@pytest.mark.parametrize(("terminated", "expected"), [
     # delta_3 = 4 + 0.5 * 50 - 40 = -11; delta_1 = 2 - 20 = -18 (terminated: V[2] is no future);
     # delta_0 = 1 + 0.5 * 20 - 10 = 1, plus 0.25 * -18 = -3.5. The reset row is 0.
-    assert advantages[:, 0].tolist() == [-3.5, -18.0, 0.0, -11.0]
-    assert returns[:, 0].tolist() == [6.5, 2.0, 0.0, 29.0]
-
-
-def test_gae_bootstraps_from_the_last_observation_at_a_time_limit():
-    # As above, but step 1 is truncated: V[2] = 30 is its future, and still step 0 sums no further.
+    (1, [-3.5, -18.0, 0.0, -11.0]),
+    # At a time limit V[2] is the future: delta_1 = 2 + 0.5 * 30 - 20 = -3, and 1 + 0.25 * -3.
+    (0, [0.25, -3.0, 0.0, -11.0]),
+])
+def test_gae_by_hand(terminated, expected):
+    """An episode that ends at step 1, its reset row, then one that the rollout cuts at step 3."""
     rewards, values = column(1, 2, 0, 4), column(10, 20, 30, 40, 50)
-    flags = [column(*x, dtype=torch.bool) for x in ((0, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0))]
-    advantages, _ = compute_gae(rewards, values, *flags, gamma=0.5, gae_lambda=0.5)
-    # delta_1 = 2 + 0.5 * 30 - 20 = -3; advantage_0 = 1 + 0.25 * -3 = 0.25
-    assert advantages[:, 0].tolist() == [0.25, -3.0, 0.0, -11.0]
+    flags = [column(*x, dtype=torch.bool)
+             for x in ((0, terminated, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0))]
+    advantages, returns = compute_gae(rewards, values, *flags, gamma=0.5, gae_lambda=0.5)
+    assert advantages[:, 0].tolist() == expected
+    kept = [0, 1, 3]
+    assert returns[kept, 0].tolist() == [expected[t] + (10, 20, 30, 40)[t] for t in kept]
+    assert returns[2, 0] == 0
 
 
 @settings(deadline=None, max_examples=60)
@@ -123,205 +168,392 @@ def test_gae_is_its_definition(ends, starts_with_reset, gamma, lam, seed):
         assert got == pytest.approx(expected, abs=1e-12)
 
 
-@pytest.mark.parametrize("argument", range(1, 5))
+@pytest.mark.parametrize("argument", range(5))
 def test_gae_refuses_shapes_that_do_not_fit(argument):
     no = torch.zeros(3, 2, dtype=torch.bool)
     arguments = [torch.zeros(3, 2), torch.zeros(4, 2), no, no, no]
     compute_gae(*arguments, 0.9, 0.9)
-    arguments[argument] = arguments[argument][:-1]
-    with pytest.raises(ValueError, match="must be"):
+    arguments[argument] = arguments[argument][:, :1]  # it would broadcast
+    with pytest.raises(ValueError, match=r"rewards are \(3, [12]\), so .* must be, too"):
         compute_gae(*arguments, 0.9, 0.9)
 
 
 # --- the loss
 
 
-def test_loss_by_hand():
-    log = math.log
-    new, old = torch.tensor([log(1.5), log(0.5), log(1.5), log(1.0)]), torch.zeros(4)
-    advantages = torch.tensor([1.0, -1.0, -1.0, 2.0])
-    policy, value, kl, clipfrac = ppo_loss(new, old, advantages, torch.tensor([3.0, 0, 0, 0]),
-                                           torch.tensor([1.0, 0, 0, 0]), clip_coef=0.2)
-    # good and up: clipped at 1.2; bad and down: clipped at 0.8; bad and up: the full 1.5
-    torch.testing.assert_close(policy, torch.tensor([-1.2, 0.8, 1.5, -2.0]))
-    assert value.tolist() == [2.0, 0.0, 0.0, 0.0]  # (3 - 1)^2 / 2
-    k3 = [0.5 - log(1.5), -0.5 - log(0.5), 0.5 - log(1.5), 0.0]  # ratio - 1 - log ratio
-    torch.testing.assert_close(kl, torch.tensor(k3))
-    assert clipfrac.tolist() == [1.0, 1.0, 1.0, 0.0]
+@pytest.mark.parametrize(("ratio", "advantage", "loss", "clipped"), [
+    (1.5, 1.0, -1.2, 1), (0.5, 1.0, -0.5, 1),  # a good action earns up to 1.2 and no more
+    (0.5, -1.0, 0.8, 1), (1.5, -1.0, 1.5, 1),  # a bad one costs in full, gains to 0.8
+    (1.1, 2.0, -2.2, 0), (0.9, -2.0, 1.8, 0),
+])
+def test_loss_by_hand(ratio, advantage, loss, clipped):
+    log_ratio = torch.tensor([math.log(ratio)], dtype=torch.float64, requires_grad=True)
+    got, kl, clipfrac = ppo_loss(log_ratio - 3, torch.tensor([-3.0]), torch.tensor([advantage]),
+                                 clip_coef=0.2)
+    assert got.item() == pytest.approx(loss) and clipfrac.item() == clipped
+    k3 = ratio - 1 - math.log(ratio)  # Schulman's estimate
+    assert kl.item() == pytest.approx(k3)
+    got.backward()  # d loss / d log ratio = loss, or 0 where the clip holds
+    assert log_ratio.grad.item() == pytest.approx(0 if loss in (-1.2, 0.8) else loss)
+    two = torch.cat((log_ratio, torch.zeros(1)))  # and a row with ratio 1: the means
+    got = ppo_loss(two, torch.zeros(2), torch.tensor([advantage, 3.0]), clip_coef=0.2)
+    assert [x.item() for x in got] == pytest.approx([(loss - 3) / 2, k3 / 2, clipped / 2])
 
 
 @settings(deadline=None)
 @given(st.floats(-20, 20, width=32), st.floats(-20, 20, width=32))
 def test_approx_kl_is_never_negative(new, old):
     x = torch.tensor([new, old])
-    assert ppo_loss(x, x.flip(0), x, x, x, 0.2)[2].min() >= 0
+    assert ppo_loss(x, x.flip(0), x, 0.2)[1] >= 0
+    assert ppo_loss(x[:1], x[1:], x[:1], 0.2)[1] >= 0
 
 
-def rollout(model, rows=64):
-    generator = torch.Generator().manual_seed(1)
-    obs = torch.randn(rows, model.kwargs["obs_dim"], generator=generator)
-    noise = torch.randn(rows, model.kwargs["act_dim"], generator=generator)
-    actions, log_prob = model.act(obs, noise)
-    advantages, returns = torch.randn(2, rows, generator=generator)
-    return [model.views(obs), actions, log_prob, advantages, returns, no_advice(actions)]
+# --- the networks
 
 
-def no_advice(actions):
-    return torch.full_like(actions, math.nan)
-
-
-def optimiser_of(model):
-    actor = [model.free_log_std, *model.actor.parameters()]
-    return torch.optim.Adam([{"params": actor, "lr": 3e-4},
-                             {"params": list(model.critic.parameters()), "lr": 1e-3}])
-
-
-def test_ratio_is_one_before_the_first_step():
-    torch.manual_seed(0)
-    model = ActorCritic(5, 2, (1, 3))
-    model.update_normaliser(torch.randn(50, 5))
-    batch = rollout(model)
-    once = PPOConfig(update_epochs=1, num_minibatches=1)
-    first = ppo_update(model, optimiser_of(model), batch, once, torch.Generator())
-    assert first["approx_kl"] == pytest.approx(0, abs=1e-10) and first["clipfrac"] == 0
-    again = ppo_update(model, optimiser_of(model), batch, once, torch.Generator())
-    assert again["approx_kl"] > 1e-8  # it has moved: the first zero was no accident
-
-
-@pytest.mark.parametrize(("target_kl", "learning_rate", "follows"), [
-    (1.0, 3e-4, 4.5e-4), (1.0, 9e-4, 1e-3), (1e-9, 3e-4, 2e-4), (1e-9, 1.2e-4, 1e-4),
-])
-def test_step_size_follows_the_kl_within_its_bounds(target_kl, learning_rate, follows):
-    torch.manual_seed(0)
-    model = ActorCritic(5, 2)
-    optimiser = optimiser_of(model)
-    optimiser.param_groups[0]["lr"] = learning_rate
-    ppo_update(model, optimiser, rollout(model), PPOConfig(target_kl=target_kl), torch.Generator())
-    assert [g["lr"] for g in optimiser.param_groups] == pytest.approx([follows, 1e-3])
-
-
-# --- the network
-
-
-MIRROR = ([1, 0, 2, 3], [1, 1, -1, 1], [2, 1, 0], [1, -1, 1])
-
-
-def test_log_prob_is_that_of_torch():
-    torch.manual_seed(0)
-    model = ActorCritic(4, 3, (2, 1), mirror=MIRROR)
-    torch.nn.init.normal_(model.free_log_std)
-    obs, actions = torch.randn(6, 5, 4), torch.randn(6, 5, 3)
-    normal = torch.distributions.Normal(model.mean(obs), model.log_std().exp())
-    log_prob, values, mean = model.evaluate(model.views(obs), actions)
-    assert torch.equal(mean, model.mean(obs))
-    torch.testing.assert_close(log_prob, normal.log_prob(actions).sum(-1))
-    torch.testing.assert_close(values, model.value(obs))
-    acted, log_prob = model.act(obs, noise := torch.randn(6, 5, 3))
-    torch.testing.assert_close(acted, normal.mean + normal.stddev * noise)
-    torch.testing.assert_close(log_prob, normal.log_prob(acted).sum(-1))
-
-
-def test_actions_have_the_mean_and_the_std():
-    torch.manual_seed(0)
-    model = ActorCritic(2, 2, init_std=(0.5, 2.0))
-    np.testing.assert_allclose(model.log_std().detach().exp(), [0.5, 2.0], rtol=1e-6)
-    with pytest.raises(ValueError, match="3 entries"):
-        ActorCritic(2, 2, init_std=(0.5, 2.0, 1.0))
-    model = ActorCritic(2, 2, init_std=0.5)
-    noise = torch.tensor([[1.0, -2.0]])
-    moved = model.act(torch.ones(1, 2), noise)[0] - torch.from_numpy(model.mean_action(np.ones(2)))
-    assert moved.tolist()[0] == pytest.approx([0.5, -1.0], abs=1e-6)
-
-
-def test_the_mean_stays_where_noise_is_felt():
-    model = ActorCritic(2, 2)
-    torch.nn.init.constant_(model.actor.head.bias, 1.5)
-    assert model.mean_action(np.ones(2)).tolist() == pytest.approx([math.tanh(1.5)] * 2, abs=0.05)
-
-
-def test_mirror_is_exact_but_for_the_preferred_side():
-    torch.manual_seed(0)
-    plain, model = ActorCritic(4, 3, (1, 2)), ActorCritic(4, 3, (1, 2), mirror=MIRROR)
-    data = torch.randn(500, 4) * torch.tensor([1.0, 5.0, 2.0, 0.1]) + 3
-    for network in (plain, model):
-        network.update_normaliser(data)
-        torch.nn.init.normal_(network.free_log_std)
-        torch.nn.init.normal_(network.actor.head.weight)
-    obs_index, obs_sign, act_index, act_sign = map(torch.tensor, MIRROR)
-    obs = torch.randn(200, 4) * 4
-    turned = obs[:, obs_index] * obs_sign
-    symmetric = obs + turned
-    with torch.no_grad():
-        mean = model.mean(symmetric)
-        assert (mean - mean[:, act_index] * act_sign).abs().max() > 0.01  # it takes a side ...
-        for network in (model.actor, model.critic):
-            network.encoders[-1][0].weight[:, -1] = 0  # ... by the last entry of what it sees
-        expected = model.mean(obs)[:, act_index] * act_sign
-        torch.testing.assert_close(model.mean(turned), expected, rtol=1e-5, atol=1e-5)
-        torch.testing.assert_close(model.value(turned), model.value(obs), rtol=1e-5, atol=1e-5)
-        assert torch.equal(model.log_std()[act_index], model.log_std())
-        # Not so by chance: without the mirror they differ.
-        assert (plain.mean(turned) - plain.mean(obs)[:, act_index] * act_sign).abs().max() > 0.1
-    assert torch.equal(model.obs_mean[obs_index] * obs_sign, model.obs_mean)
-    assert torch.equal(model.obs_sum_sq[obs_index], model.obs_sum_sq)
-    both = torch.cat((data, data[:, obs_index] * obs_sign)).double()
-    torch.testing.assert_close(model.obs_mean, both.mean(0))
-    torch.testing.assert_close(model.obs_sum_sq / model.count, both.var(0, correction=0))
-
-
-@pytest.mark.parametrize("part", [0, 1, 2, 3])
-def test_a_mirror_that_is_not_its_own_inverse_is_refused(part):
-    bad = [list(p) for p in MIRROR]
-    bad[part] = bad[part][:-1] if part % 2 else [1, 2, 0, 3][: len(bad[part])]
-    with pytest.raises(ValueError, match="twice must give"):
-        ActorCritic(4, 3, mirror=bad)
-
-
-def test_a_scan_is_read_column_by_column():
-    torch.manual_seed(0)
-    encoder = ppo.ScanEncoder(3, 4, 5)
-    scan = torch.randn(7, 3, 4)
-    columns = torch.cat([encoder.column(scan[:, :, k]) for k in range(4)], dim=-1)
-    torch.testing.assert_close(encoder(scan.flatten(1)), encoder.scan(columns))
-
-
-def test_a_scan_beyond_the_observation_is_refused():
-    with pytest.raises(ValueError, match=r"scan of \(5, 1\)"):
-        ActorCritic(4, 3, exteroceptive=(5, 1))
-    for valid in ((0, 0), (2, 2)):
-        assert ActorCritic(4, 3, exteroceptive=valid).mean_action(np.zeros((7, 4))).shape == (7, 3)
+def test_moments_are_numpys():
+    x = torch.from_numpy(np.random.default_rng(0).normal(3, 2, 1000)).float()
+    assert ppo.moments(x) == pytest.approx((x.double().mean().item(), x.double().numpy().var()))
+    assert ppo.moments(torch.full((7,), 0.1))[1] >= 0  # rounding makes no negative variance
 
 
 def test_normaliser_is_numpys_mean_and_std_and_travels_with_the_model():
     rng = np.random.default_rng(0)
     data = rng.normal(1e4, [1e-1, 1.0, 0.0], (900, 3)).astype(np.float32)
     model = ActorCritic(3, 1)
+    assert model.normaliser(torch.tensor([3.0, 30, -30])).tolist() == [3, 10, -10]  # knows nothing
     for part in np.split(data, [1, 17, 400]):
-        model.update_normaliser(torch.from_numpy(part))
-    state = model.state_dict()
-    exact = data.astype(np.float64)
-    np.testing.assert_allclose(state["obs_mean"], exact.mean(0), rtol=1e-12)
-    std = (state["obs_sum_sq"] / state["count"]).sqrt()
-    np.testing.assert_allclose(std, exact.std(0), rtol=1e-4, atol=1e-3)
-    views = model.views(torch.from_numpy(data))[:, 0]
-    assert views[:, :2].std(0, correction=0).tolist() == pytest.approx([1, 1], rel=1e-2)
-    assert views[:, 2].abs().max() < 1e-3  # a constant says nothing, instead of exploding
-    absurd = model.mean_action(np.array([1e30, -1e30, 1e4], np.float32))
-    assert np.array_equal(absurd, model.mean_action(np.array([1e20, -1e20, 1e4], np.float32)))
+        model.normaliser.update(torch.from_numpy(part))
+    state, exact = model.state_dict(), data.astype(np.float64)
+    assert state["normaliser.count"] == 900
+    np.testing.assert_allclose(state["normaliser.mean"], exact.mean(0), rtol=1e-12)
+    std = (state["normaliser.sum_sq"] / 900).sqrt()
+    np.testing.assert_allclose(std, exact.std(0), rtol=1e-6, atol=1e-5)
+    seen = model.normaliser(torch.from_numpy(data))
+    assert seen.dtype == torch.float32
+    assert seen[:, :2].std(0, correction=0).tolist() == pytest.approx([1, 1], rel=1e-2)
+    assert seen[:, 2].abs().max() < 1e-3  # a constant says nothing, instead of exploding
+    assert model.normaliser(torch.tensor([1e30, -1e30, 1e4])).tolist() == [10, -10, 0]
+    other = ActorCritic(3, 1)
+    other.load_state_dict(state)
+    assert torch.equal(other.normaliser(torch.from_numpy(data)), seen)
+
+
+def test_log_prob_is_that_of_a_gaussian():
+    torch.manual_seed(0)
+    model = ActorCritic(4, 3, n_scan=2, init_std=(0.1, 0.5, 2.0))
+    torch.nn.init.normal_(model.actor.head.weight)
+    obs, actions = torch.randn(6, 5, 4), torch.randn(6, 5, 3)
+    mean, std = torch.tensor(model.mean_action(obs)), torch.tensor([0.1, 0.5, 2.0])
+    by_hand = -((actions - mean) ** 2) / (2 * std**2) - (std * math.sqrt(2 * math.pi)).log()
+    log_prob = model.log_prob(obs, actions)
+    torch.testing.assert_close(log_prob, by_hand.sum(-1))
+    normal = torch.distributions.Normal(mean, std)
+    torch.testing.assert_close(log_prob, normal.log_prob(actions).sum(-1))
+    assert model.value(obs).shape == (6, 5)
+
+
+def test_the_first_policy_is_the_zero_action_and_later_means_stay_below_one():
+    torch.manual_seed(0)
+    model, obs = ActorCritic(4, 3, init_std=0.5), np.random.default_rng(0).normal(size=(99, 4))
+    assert np.abs(model.mean_action(obs)).max() < 0.02 and model.std.tolist() == [0.5] * 3
+    torch.nn.init.zeros_(model.actor.head.weight)
+    model.actor.head.bias.data.copy_(torch.tensor([0.5, -2.0, 99.0]))
+    action = model.mean_action(np.zeros(4))
+    assert action.dtype == np.float32
+    assert action.tolist() == pytest.approx([math.tanh(0.5), math.tanh(-2.0), 1.0])
+
+
+@pytest.mark.parametrize("network", ["actor", "critic"])
+def test_each_part_of_the_observation_has_its_own_encoder(network):
+    """An encoder that is silenced takes its own entries away, and no others."""
+    for silent, gone in ((0, [0, 1, 2]), (1, [3, 4])):
+        torch.manual_seed(0)
+        net = getattr(ActorCritic(5, 2, n_scan=3), network)
+        torch.nn.init.zeros_(net.encoders[silent][-2].weight)
+        obs = torch.randn(1, 5, requires_grad=True)
+        net(obs).sum().backward()
+        assert (obs.grad[0] == 0).nonzero()[:, 0].tolist() == gone
+    for n_scan in (0, 5):
+        assert len(getattr(ActorCritic(5, 2, n_scan=n_scan), network).encoders) == 1
+
+
+@pytest.mark.parametrize(("wrong", "named"), [
+    ({"n_scan": 5}, "5 entries of a scan and 1 of init_std do not fit observations of 4"),
+    ({"init_std": (0.1, 0.2)}, "0 entries of a scan and 2 of init_std .* actions of 3"),
+])
+def test_parts_that_do_not_fit_are_refused(wrong, named):
+    with pytest.raises(ValueError, match=named):
+        ActorCritic(4, 3, **wrong)
+
+
+# --- the mirror
+
+
+def test_the_image_of_an_image_is_the_original():
+    index, sign = [1, 0, 2, 3], [1, 1, -1, 1]
+    x = torch.tensor([[1.0, 2, 3, 4], [5, 6, 7, 8]])
+    both = with_images(x, index, sign)
+    assert both.tolist() == [[1, 2, 3, 4], [5, 6, 7, 8], [2, 1, -3, 4], [6, 5, -7, 8]]
+    assert torch.equal(with_images(both[2:], index, sign)[2:], x)
+
+
+@pytest.mark.parametrize("mirror", [None, (([0, 1], [-1, 1]), ([0], [-1]))])
+def test_what_is_learned_on_one_side_holds_on_the_other(mirror):
+    """Only obs[0] = 1 ever occurs, where a large action is best; its image is a small one."""
+    model = train(lambda: Probe(lambda obs, action, t: action, signs=(1, 1)), 10, mirror=mirror)
+    right, left = model.mean_action(np.float32([[1, 1], [-1, 1]]))[:, 0]
+    assert right > 0.4 and (abs(left + right) < 0.05) == bool(mirror)
+    assert (model.normaliser.mean[0] == 0) == bool(mirror)
+
+
+# --- collecting
+
+
+class Script(gym.Env):
+    """Observations count: 10 * episode + step. Action k is in `taken`, the reward is its number."""
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float32)
+    action_space = gym.spaces.Box(-0.5, 0.25, (2, 1), np.float64)
+
+    def __init__(self, length, truncates, infos=None):
+        self.length, self.truncates, self.infos = length, truncates, infos
+        self.episode, self.taken, self.seeds = -1, [], []
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.seeds += [seed] if seed is not None else []
+        self.episode, self.t = self.episode + 1, 0
+        return np.float32([10 * self.episode]), {}
+
+    def step(self, action):
+        self.taken.append(action)
+        self.t += 1
+        end, info = self.t == self.length, self.infos[self.episode] if self.infos else {}
+        return (np.float32([10 * self.episode + self.t]), float(len(self.taken)),
+                end and not self.truncates, end and self.truncates, info)
+
+
+def test_a_rollout_holds_what_happened():
+    envs = [Script(2, False), Script(3, True)]
+    collector = Collector(lambda index: envs[index], 2, 0, 1)
+    torch.manual_seed(0)
+    model = ActorCritic(1, 2, init_std=(0.4, 0.8))
+    collector.reset(5)
+    random = collector.generator.clone_state()
+    noise = torch.cat([torch.randn(T, 2, 2, generator=random) for T in (6, 3)])
+    first, second = collector.collect(model, 6), collector.collect(model, 3)
+    obs, actions, rewards, terminated, done, prev_done = (
+        torch.cat((a[:6], b)) for a, b in zip(first, second, strict=True))
+    assert torch.equal(first[0][6], second[0][0])  # the second begins where the first has ended
+    # The first env: two steps and a reset row; the second: three steps and a reset row.
+    assert obs[..., 0].T.tolist() == [[0, 1, 2, 10, 11, 12, 20, 21, 22, 30],
+                                      [0, 1, 2, 3, 10, 11, 12, 13, 20, 21]]
+    assert rewards.T.tolist() == [[1, 2, 0, 3, 4, 0, 5, 6, 0], [1, 2, 3, 0, 4, 5, 6, 0, 7]]
+    ends = [[0, 1, 0, 0, 1, 0, 0, 1, 0], [0, 0, 1, 0, 0, 0, 1, 0, 0]]
+    assert done.T.tolist() == ends and terminated.T.tolist() == [ends[0], [0] * 9]
+    assert prev_done.T.tolist() == [[0, *end[:-1]] for end in ends]
+    # The rollout keeps the policy's own actions; the env gets them clipped, as its space is.
+    assert actions.min() < -0.5 and actions.max() > 0.25
+    torch.testing.assert_close(actions, model.policy(obs[:-1]).mean + model.std * noise)
+    for k, env in enumerate(envs):
+        own = actions[~prev_done[:, k], k].numpy()
+        np.testing.assert_array_equal(np.array(env.taken)[..., 0], own.clip(-0.5, 0.25))
+        assert env.taken[0].dtype == np.float64
+
+
+def test_all_that_follows_a_reset_is_a_function_of_its_seed():
+    seeds, noise = [], []
+    for rank, update in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        envs, states_ = {}, []
+        make = lambda index, envs=envs: envs.setdefault(index, Script(2, True))  # noqa: E731
+        collector = Collector(make, 5, rank, 2)
+        for _ in range(2):
+            collector.reset(7, update, rank)
+            states_.append(collector.generator.get_state())
+        assert torch.equal(*states_) and list(envs) == ([0, 2, 4], [1, 3])[rank]
+        assert all(env.seeds[0] == env.seeds[1] for env in envs.values())
+        seeds += [env.seeds[0] for env in envs.values()]
+        noise.append(torch.randn((), generator=collector.generator).item())
+    assert len(set(seeds)) == len(seeds) == 10 and len(set(noise)) == 4
+
+
+def test_averages_leave_out_what_nobody_said():
+    infos = ([{"task": "left", "t_cr": 0.5}, {"task": "left", "t_cr": 1.0, "success": True}],
+             [{"task": "right", "t_cr": 0.0}] * 2)
+    # Returns 1 + 2, then 3 + 4, which ends with the other's 1 + 2 + 3 + 4 + 5.
+    collector = Collector(lambda index: Script(2 + 3 * index, False, infos[index]), 2, 0, 1)
+    names, groups = ("t_cr", "success", "fall"), ("left", "right", "up")
+    collector.reset(0)
+    assert all(math.isnan(mean) for mean in collector.averages(names, groups).values())
+    collector.collect(ActorCritic(1, 2), 5)
+    means = collector.averages(names, groups)
+    assert means == pytest.approx(
+        {"return": (3 + 7 + 15) / 3, "t_cr": 0.5, "success": 1.0, "fall": math.nan,
+         "t_cr/left": 0.75, "t_cr/right": 0.0, "t_cr/up": math.nan}, nan_ok=True)
+
+
+# --- one update
+
+
+def experience(model, T=16, N=4, ends=True):
+    """A rollout of random numbers as `collect` returns it, with the reset row of each ending."""
+    generator = torch.Generator().manual_seed(1)
+    obs = torch.randn(T + 1, N, model.kwargs["obs_dim"], generator=generator)
+    noise = torch.randn(T, N, model.kwargs["act_dim"], generator=generator)
+    with torch.no_grad():
+        actions = model.policy(obs[:-1]).mean + model.std * noise
+    done = torch.zeros(T, N, dtype=torch.bool)
+    done[3, 0] = done[9, 2] = done[12, 1] = ends
+    prev_done = done.roll(1, 0)
+    return [obs, actions, torch.randn(T, N, generator=generator), done & (obs[1:, :, 0] > 0), done,
+            prev_done]
+
+
+def fresh(**changes):
+    """(model, optimiser, config) of one encoder, with the optimiser of `learn`."""
+    config = PPOConfig(hidden=(16,), **changes)
+    shape = type("Shape", (), {"obs_dim": 5, "act_dim": 2})
+    return *ppo.make_model(config, shape, None), config
+
+
+@pytest.fixture
+def losses(monkeypatch):
+    """All calls of ppo_loss as (log_prob, old_log_prob, advantages, loss, approx_kl)."""
+    calls = []
+
+    def spy(log_prob, old, advantages, clip_coef):
+        result = ppo_loss(log_prob, old, advantages, clip_coef)
+        calls.append((log_prob, old, advantages, *result[:2]))
+        return result
+
+    monkeypatch.setattr(ppo, "ppo_loss", spy)
+    return calls
+
+
+def test_ratio_is_one_on_the_first_minibatch_and_no_other(losses):
+    model, optimiser, config = fresh(update_epochs=1, num_minibatches=4)
+    ppo.update(model, optimiser, experience(model), config, torch.Generator(), 0.03)
+    (log_prob, old, advantages, loss, kl), *others = losses
+    torch.testing.assert_close(log_prob, old, rtol=0, atol=1e-5)
+    assert loss.item() == pytest.approx(-advantages.mean().item(), abs=1e-5)
+    assert abs(kl.item()) < 1e-9
+    assert len(others) == 3 and all(kl.item() > 1e-8 for *_, kl in others)
+
+
+@pytest.mark.parametrize("bound", [99.0, 1.0])
+def test_an_update_reports_and_uses_what_its_rollout_holds(bound, losses):
+    model, optimiser, config = fresh(update_epochs=1, num_minibatches=1, max_advantage=bound)
+    rollout = experience(model)
+    with torch.no_grad():
+        values = model.value(rollout[0])
+    kept = ~rollout[-1]
+    raw, returns = (x[kept].double().numpy()
+                    for x in compute_gae(rollout[2], values, *rollout[3:], 0.995, 0.95))
+    stats = ppo.update(model, optimiser, rollout, config, torch.Generator(), 0.03)
+    expected = ((raw - raw.mean()) / raw.std()).clip(-bound, bound)
+    expected -= expected.mean()
+    assert len(raw) == 16 * 4 - 3
+    np.testing.assert_allclose(losses[0][2].sort()[0], np.sort(expected), atol=1e-5)
+    assert stats == pytest.approx({
+        "approx_kl": 0, "clipfrac": 0, "value_loss": (raw**2).mean() / 2, "std": 0.37,
+        "explained_variance": 1 - raw.var() / returns.var(), "learning_rate": 7.5e-4}, abs=1e-5)
+
+
+def test_reset_rows_teach_nothing():
+    ends = []
+    for nonsense in (0.0, 1e6):
+        model, optimiser, config = fresh(update_epochs=1)
+        rollout = experience(model)
+        for part in rollout[1:3]:  # the action that nobody took, and its reward
+            part[rollout[-1]] = nonsense
+        ppo.update(model, optimiser, rollout, config, torch.Generator().manual_seed(0), 0.03)
+        ends.append(states(model))
+    assert same_bits(*ends)
+
+
+@pytest.mark.parametrize(("target_kl", "learning_rate", "follows", "epochs"), [
+    (1.0, 3e-4, 4.5e-4, 3), (1.0, 9e-4, 1e-3, 3), (1e-9, 3e-4, 2e-4, 1), (1e-9, 1.2e-5, 1e-5, 1),
+    (None, 3e-4, 3e-4, 3),
+])
+def test_step_size_follows_the_kl_and_too_large_a_step_ends_the_update(
+        target_kl, learning_rate, follows, epochs, losses):
+    model, optimiser, config = fresh(learning_rate=learning_rate)
+    start, rollout = states(model), experience(model)
+    if target_kl is None:  # what the update will reach
+        probe, other, _ = fresh(learning_rate=learning_rate)
+        target_kl = ppo.update(probe, other, rollout, config, torch.Generator().manual_seed(0),
+                               1.0)["approx_kl"]
+        losses.clear()
+        assert same_bits(states(model), start)
+    stats = ppo.update(model, optimiser, rollout, config, torch.Generator().manual_seed(0),
+                       target_kl)
+    assert [g["lr"] for g in optimiser.param_groups] == pytest.approx([follows, 1e-3])
+    assert stats["learning_rate"] == pytest.approx(follows)
+    assert len(losses) == epochs * config.num_minibatches
+    kls = [kl.item() for *_, kl in losses[-config.num_minibatches:]]  # of the last pass
+    assert stats["approx_kl"] == pytest.approx(np.mean(kls), rel=1e-4, abs=1e-9)
+
+
+def test_actor_and_critic_are_clipped_each_on_its_own():
+    model, optimiser, _ = fresh()
+    obs = torch.randn(8, 5, generator=torch.Generator().manual_seed(0))
+    small = model.policy(obs).mean.sum() * 1e-3
+    loss = small + 1e3 * model.value(obs).sum()
+    exact = torch.autograd.grad(loss, list(model.parameters()), retain_graph=True)
+    ppo.descend(model, optimiser, loss, max_grad_norm=0.5)
+    got = [p.grad for p in model.parameters()]
+    n = len(list(model.actor.parameters()))
+    for mine, right in zip(got[:n], exact[:n], strict=True):
+        torch.testing.assert_close(mine, right)  # the critic's 1e3 does not scale it down
+    norm = torch.cat([g.flatten() for g in exact[n:]]).norm()
+    for mine, right in zip(got[n:], exact[n:], strict=True):
+        torch.testing.assert_close(mine, right * 0.5 / norm)
+
+
+# --- two ranks
+
+
+def test_two_ranks_hold_the_same_bits_and_learn_what_one_does(tmp_path):
+    """Episodes' length depends on the env: the ranks have different numbers of rows."""
+    env = lambda index, leg: Probe(  # noqa: E731
+        lambda obs, action, t: action + index, length=2 + 3 * index)
+
+    def shared(rank=0, world=1):  # two passes over a share of one rollout
+        model, optimiser, config = fresh(update_epochs=2, num_minibatches=1)
+        mine = [x[:, rank::world] for x in experience(model, ends=False)]
+        return ppo.update(model, optimiser, mine, config, torch.Generator(), 0.03), states(model)
+
+    def main(rank):
+        torch.manual_seed(rank)  # the parameters must not depend on it
+        Probe.seeds.clear()
+        rows, config = [], PPOConfig(total_timesteps=900, checkpoint_every=2, **SMALL)
+        model, steps = learn(env, config, run_dir=tmp_path / "run",
+                             on_update=lambda _, row: rows.append(row))
+        moments = ppo.moments(torch.arange(4.0)[rank::3])  # 0, 3 and 1
+        torch.save([states(model), steps, len(rows), moments, shared(rank, 2), Probe.seeds],
+                   tmp_path / f"rank{rank}.pt")
+
+    assert in_ranks(2, main) == [0, 0]
+    (one, steps, calls, moments, mine, seeds), (two, other_steps, no_calls, _, others, more) = (
+        torch.load(tmp_path / f"rank{rank}.pt") for rank in (0, 1))
+    assert same_bits(one, two) and same_bits(mine[1], others[1]) and mine[0] == others[0]
+    rows = table(tmp_path / "run")
+    # 32 steps of 4 envs; of env k every (3 + 3 k)th is a reset: 10, 5, 3 and 2 of 32.
+    assert int(rows[0]["steps"]) == 128 - 20
+    assert one["normaliser.count"] == int(rows[-1]["steps"]) == steps == other_steps >= 900
+    assert calls == len(rows) and no_calls == 0
+    assert moments == pytest.approx([4 / 3, 14 / 9])
+    assert len(seeds) == len(more) >= 2 * 4 and len({*seeds, *more}) == len(seeds) + len(more)
+    stats, state = shared()
+    assert mine[0] == pytest.approx(stats, rel=1e-4, abs=1e-7)
+    torch.testing.assert_close(mine[1], state, rtol=1e-4, atol=1e-6)
 
 
 # --- it learns
 
 
-def test_probe_constant_reward():
-    model = train(lambda: Probe(blind=True), 12)
-    assert model.value(torch.zeros(2)).item() == pytest.approx(1, abs=0.05)
-
-
-def test_probe_reward_is_the_observation():
-    model = train(lambda: Probe(lambda obs, action, t: obs[0]), 20)
-    values = model.value(torch.tensor([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]]))
-    assert values.tolist() == pytest.approx([1, 1, -1, -1], abs=0.15)
+FOUR = [[1, 1], [1, -1], [-1, 1], [-1, -1]]
 
 
 class Delayed(Probe):
@@ -331,422 +563,137 @@ class Delayed(Probe):
         super().__init__(lambda obs, action, t: t, length=2)
 
     def observe(self):
-        self.obs = np.array([getattr(self, "t", 0), 0], np.float32)
+        self.obs = np.array([self.t, 0], np.float32)
         return self.obs
 
 
-def test_probe_delayed_reward():
-    model = train(Delayed, 25, gamma=0.5)
-    values = model.value(torch.tensor([[0.0, 0.0], [1.0, 0.0]]))
-    assert values.tolist() == pytest.approx([0.5, 1], abs=0.1)  # gamma * 1, then 1
+@pytest.mark.parametrize(("env", "updates", "gamma", "obs", "values"), [
+    (lambda: Probe(signs=(0, 0)), 8, 0.9, [[0, 0]], [1]),
+    (lambda: Probe(lambda obs, action, t: obs[0]), 15, 0.9, FOUR, [1, 1, -1, -1]),
+    (Delayed, 15, 0.5, [[0, 0], [1, 0]], [0.5, 1]),
+    # Reward 1 for ever: V = 1 / (1 - gamma). Taking the time limit for an end would give about 3.
+    (lambda: Probe(length=5, truncates=True, signs=(0, 0)), 20, 0.8, [[0, 0]], [5]),
+], ids=["constant reward", "reward is the observation", "delayed reward", "endless task"])
+def test_values(env, updates, gamma, obs, values):
+    model = train(env, updates, gamma=gamma)
+    assert model.value(torch.tensor(obs)).tolist() == pytest.approx(values, abs=0.1)
 
 
-def test_probe_reward_is_the_action():
-    rewards = lambda obs, action, t: -((action - 0.6) ** 2)  # noqa: E731
-    model = train(lambda: Probe(rewards, blind=True), 45)
-    assert model.mean_action(np.zeros(2)).item() == pytest.approx(0.6, abs=0.12)
+def test_actions():
+    """What pays is a positive action; and one that follows the observation."""
+    model = train(lambda: Probe(lambda obs, action, t: np.sign(action), signs=(0, 0)), 20)
+    assert model.mean_action(np.zeros(2)).item() > 0.6
+    model = train(lambda: Probe(lambda obs, action, t: obs[0] * action), 20)
+    assert (model.mean_action(FOUR)[:, 0] * np.array(FOUR)[:, 0] > 0.6).all()
 
 
-def test_probe_action_must_follow_the_observation():
-    model = train(lambda: Probe(lambda obs, action, t: obs[0] * action), 30)
-    obs = np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]], np.float32)
-    assert (model.mean_action(obs)[:, 0] * obs[:, 0] > 0.6).all()
+def test_noise_and_target_kl_fall_linearly_over_the_training(monkeypatch):
+    targets, rows, real = [], [], ppo.update
+    monkeypatch.setattr(ppo, "update", lambda *args: targets.append(args[5]) or real(*args))
+    config = PPOConfig(total_timesteps=4 * 128, init_std=0.5, noise=(1.0, 0.2),
+                       target_kl=(0.05, 0.01), **SMALL)
+    model, steps = learn(lambda index, leg: Probe(length=10_000), config,
+                         on_update=lambda _, row: rows.append(row))
+    assert steps == 512 and [row["steps"] for row in rows] == [128, 256, 384, 512]
+    assert [row["std"] for row in rows] == pytest.approx([0.5, 0.4, 0.3, 0.2])
+    assert targets == pytest.approx([0.05, 0.04, 0.03, 0.02])
+    assert model.std.tolist() == pytest.approx([0.2])
 
 
-def test_value_under_a_time_limit_is_that_of_an_endless_task():
-    # Reward 1 for ever: V = 1 / (1 - gamma) = 5. Taking the limit for an end would give about 3.
-    model = train(lambda: Probe(length=5, truncates=True, blind=True), 50, gamma=0.8)
-    assert model.value(torch.zeros(2)).item() == pytest.approx(5, abs=0.3)
-
-
-def test_pendulum_swings_up():
-    def make(index):
-        env = gym.wrappers.RescaleAction(gym.make("Pendulum-v1"), np.float32(-1), np.float32(1))
-        return gym.wrappers.TransformReward(env, lambda reward: 0.1 * reward)
-
-    config = PPOConfig(
-        total_timesteps=80_000, num_envs=8, num_steps=256, gamma=0.95, update_epochs=10,
-        num_minibatches=16, learning_rate=1e-3, max_learning_rate=3e-3, critic_learning_rate=3e-3,
-        target_kl=0.02, init_std=0.6, noise_correlation=0.5,
-        encoder_hidden=(64,), trunk_hidden=(64,),
-    )
-    model = learn(make, config, episode_keys=())
-    returns, env = [], make(0)
-    for seed in range(20):
-        obs, _ = env.reset(seed=1000 + seed)
-        returns.append(0.0)
-        for _ in range(200):
-            obs, reward, *_ = env.step(model.mean_action(obs).clip(-1, 1))
-            returns[-1] += 10 * reward
-    assert np.mean(returns) > -200  # hanging gives about -1,400, random torque about -1,200
-
-
-def test_the_same_seed_gives_the_same_bits_and_another_does_not():
+def test_the_seed_decides_every_bit():
     env = lambda: Probe(lambda obs, action, t: obs[0] * action, length=3)  # noqa: E731
     one, two, other = (states(train(env, 4, seed=seed)) for seed in (3, 3, 4))
     assert same_bits(one, two) and not same_bits(one, other)
 
 
-def test_seeds_never_overlap():
-    seen = []
-
-    class Recorder(Probe):
-        def reset(self, *, seed=None, options=None):
-            seen.extend([] if seed is None else [seed])
-            return super().reset(seed=seed)
-
-    train(Recorder, 7, checkpoint_every=2)
-    assert len(seen) >= 4 * 4 and len(set(seen)) == len(seen)
-
-
-def test_the_noise_never_exceeds_its_bound():
-    stds = []
-    learn(lambda index: Square(1.0), PPOConfig(total_timesteps=600, max_std=0.2, **SMALL),
-          on_update=lambda model, row: stds.append(row["std"]))
-    assert len(stds) >= 2 and max(stds) <= 0.2 + 1e-6
-
-
-def test_advantages_are_bounded(monkeypatch):
-    model = ActorCritic(2, 1)
-    views, actions, log_prob, _, returns, guide = rollout(model, 4)
-    advantages = torch.tensor([0.0, 0.0, 0.0, 8.0])  # mean 2, std sqrt(12)
-    for bound, valid in ((10.0, [-0.577350, 1.732051]), (1.0, [-0.577350, 1.0])):
-        seen = set()
-
-        def spy(log_prob, old, advantages, *rest, seen=seen):
-            seen.update(advantages.tolist())
-            return ppo_loss(log_prob, old, advantages, *rest)
-
-        monkeypatch.setattr(ppo, "ppo_loss", spy)
-        config = PPOConfig(max_advantage=bound, num_minibatches=1, num_envs=1, num_steps=4)
-        batch = [views, actions, log_prob, advantages, returns, guide]
-        ppo_update(model, optimiser_of(model), batch, config, torch.Generator())
-        assert sorted(seen) == pytest.approx(valid, abs=1e-5)
-
-
-def test_the_noise_lasts_from_step_to_step():
-    taken = []
-    env = partial(Probe, lambda obs, action, t: taken.append(action) or 0.0, length=10_000)
-    config = PPOConfig(total_timesteps=2000, **SMALL | {"num_envs": 1, "num_steps": 2000},
-                       init_std=0.3, noise_correlation=(0.9,), num_minibatches=1)
-    learn(lambda index: env(), config, episode_keys=())
-    noise = np.array(taken)
-    assert noise.std() == pytest.approx(0.3, abs=0.06)  # as large as without
-    for lag in (1, 5):
-        assert np.corrcoef(noise[lag:], noise[:-lag])[0, 1] == pytest.approx(0.9**lag, abs=0.1)
-    with pytest.raises(ValueError, match="noise_correlation has 2 entries"):
-        learn(lambda index: env(), PPOConfig(noise_correlation=(0.9, 0.0), **SMALL))
-
-
 # --- spaces
-
-
-class Square(gym.Env):
-    """Two-dimensional observations and actions, in float64."""
-
-    observation_space = gym.spaces.Box(-np.inf, np.inf, (3, 2))
-    action_space = gym.spaces.Box(-1e-3, 1e-3, (2, 2), np.float64)
-
-    def __init__(self, reward=0.0):
-        self.value = reward
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        return self.np_random.normal(size=(3, 2)).astype(np.float32), {}
-
-    def step(self, action):
-        assert self.action_space.contains(action) and (np.abs(action) == 1e-3).any()
-        return self.reset()[0], self.value, False, False, {}
-
-
-def test_any_box_shape():
-    model = learn(lambda index: Square(), PPOConfig(total_timesteps=1, **SMALL))
-    assert (model.kwargs["obs_dim"], model.kwargs["act_dim"]) == (6, 4)
 
 
 def test_other_spaces_are_refused():
     env = Probe()
     env.action_space = gym.spaces.Discrete(2)
     with pytest.raises(ValueError, match=r"must be Box.*Discrete"):
-        learn(lambda index: env, PPOConfig(total_timesteps=1, num_envs=1))
+        learn(lambda index, leg: env, PPOConfig(total_timesteps=1, num_envs=1))
 
 
 @pytest.mark.parametrize("reward", [math.nan, math.inf])
-def test_rewards_that_are_no_numbers_stop_the_training(reward):
-    with pytest.raises(FloatingPointError, match="update 1 "):
-        learn(lambda index: Square(reward), PPOConfig(total_timesteps=1, **SMALL))
-
-
-@pytest.mark.parametrize(("name", "value", "valid"), [
-    ("total_timesteps", 0, "at least 1"), ("total_timesteps", 1e6, "whole"),
-    ("num_envs", -1, "at least 1"), ("num_steps", 2.5, "whole"), ("update_epochs", 0, "at least 1"),
-    ("num_minibatches", 1921, "at most 1920"), ("checkpoint_every", 0, "at least 1"),
-    ("gamma", 1.01, "[0, 1]"), ("gamma", math.nan, "[0, 1]"), ("gae_lambda", -0.1, "[0, 1]"),
-    ("clip_coef", 0, "above 0"), ("max_grad_norm", math.inf, "finite"), ("init_std", -1, "above 0"),
-    ("noise_correlation", 1.5, "in [0, 1]"), ("noise_correlation", (0.5, -1), "in [0, 1]"),
-    ("max_std", math.nan, "above 0"), ("max_advantage", 0.0, "above 0"),
-    ("init_std", (0.1, 0.0), "above 0"), ("init_std", (), "above 0"),
-    ("learning_rate", 1.0, "[0.0001, 0.001]"), ("learning_rate", 1e-5, "[0.0001, 0.001]"),
-    ("critic_learning_rate", 0.0, "above 0"), ("target_kl", 0.0, "above 0"),
-    ("seed", -1, "at least 0"),
-    ("exteroceptive", (-1, 2), "at least 0"), ("exteroceptive", (4,), "two whole"),
-    ("encoder_hidden", (), "non-empty"),
-    ("trunk_hidden", (64, 0), "at least 1"),
-])
-def test_bad_settings_are_named(name, value, valid):
-    with pytest.raises(ValueError) as error:
-        PPOConfig(**{name: value})
-    assert f"{name} = {value!r}" in str(error.value) and valid in str(error.value)
+def test_rewards_that_are_no_numbers_stop_the_training_and_reach_no_checkpoint(reward, tmp_path):
+    env = lambda index, leg: Probe(lambda obs, action, t: next(rewards))  # noqa: E731
+    rewards = iter([1.0] * 80 + [reward] * 80)
+    with pytest.raises(FloatingPointError, match="infinite or NaN"):
+        learn(env, PPOConfig(total_timesteps=999, checkpoint_every=1, **SMALL), run_dir=tmp_path)
+    assert ppo.load_checkpoint(tmp_path / "checkpoint.pt")["counters"][0] == 1
 
 
 # --- the run folder
 
 
-def run(folder, updates, **options):
-    # Episodes of 20 steps in rollouts of 32 x 4: without the reset rows more than 120 steps.
-    config = PPOConfig(total_timesteps=updates * 120, checkpoint_every=2, **SMALL)
-    env = lambda index: Probe(lambda obs, action, t: obs[0] * action, length=20)  # noqa: E731
-    return learn(env, config, run_dir=folder, groups=("left", "right"), **options)
+def test_a_run_leaves_its_files_and_tells_on_update_what_it_writes(tmp_path):
+    def on_update(model, row):
+        rows.append(row)
+        assert (tmp_path / "checkpoint.pt").exists()  # from the first update on
+
+    rows, meta = [], {"tasks": ["left", "right"], "seed": 7}
+    config = PPOConfig(total_timesteps=240, **SMALL)
+    env = lambda index, leg: Probe(lambda obs, action, t: obs[0], length=20)  # noqa: E731
+    model, steps = learn(env, config, run_dir=tmp_path, meta=meta, episode_keys=("t_cr", "fall"),
+                         groups=("left",), on_update=on_update)
+    assert {path.name for path in tmp_path.iterdir()} == {
+        "config.json", "progress.csv", "checkpoint.pt", "curve.png", "lock"}
+    written = table(tmp_path)
+    assert len(written) == 2 and set(written[0]) == {
+        "update", "steps", "minutes", "return", "t_cr", "fall", "t_cr/left", "collect_s", "learn_s",
+        "approx_kl", "clipfrac", "value_loss", "explained_variance", "std", "learning_rate"}
+    for mine, told in zip(written, rows, strict=True):
+        assert {k: float(v) for k, v in mine.items()} == pytest.approx(told, nan_ok=True)
+    # The first checkpoint resets all envs, so of each 32 steps of an env the 21st is a reset.
+    assert steps == rows[-1]["steps"] == 2 * 128 - 4 * 2 and rows[-1]["update"] == 2
+    assert math.isnan(rows[-1]["fall"]) and rows[-1]["t_cr/left"] == -1
+    assert json.loads((tmp_path / "config.json").read_text()) == {
+        "ppo": json.loads(json.dumps(vars(config))), "meta": meta}
+    assert (tmp_path / "curve.png").read_bytes().startswith(b"\x89PNG")
+    loaded, kept = ppo.load_policy(tmp_path / "checkpoint.pt")
+    assert kept == meta and same_bits(states(loaded), states(model))
 
 
-def table(folder):
-    with open(folder / "progress.csv", newline="") as file:
-        return list(csv.DictReader(file))
-
-
-def test_stopping_and_resuming_changes_no_bit(tmp_path):
-    at = {}
-    whole = run(tmp_path / "whole", 6, on_update=lambda m, row: at.update({row["update"]: row}))
-    run(tmp_path / "parts", 4)
-    stopped = ppo.load_checkpoint(tmp_path / "parts" / "checkpoint.pt")["counters"]
-    assert stopped["update"] == 4 and stopped["steps"] == at[4]["steps"]
-    with open(tmp_path / "parts" / "progress.csv", "a") as file:
-        file.write("5,999\n6,9")  # what a crash after the checkpoint leaves behind
-    parts = run(tmp_path / "parts", 6, resume=True)
-    assert same_bits(states(whole), states(parts))
-    assert [row["update"] for row in table(tmp_path / "parts")] == list("123456")
-    last, other = table(tmp_path / "parts")[-1], table(tmp_path / "whole")[-1]
-    assert last["steps"] == other["steps"] and last["approx_kl"] == other["approx_kl"]
-    assert float(last["minutes"]) > stopped["minutes"] > 0
-
-
-def test_a_resumed_run_keeps_to_its_new_bounds_of_the_step_size(tmp_path):
-    env, rows = partial(Probe, length=3), []
-    config = PPOConfig(total_timesteps=300, learning_rate=1e-3, **SMALL)
-    learn(lambda index: env(), config, run_dir=tmp_path)
-    config = PPOConfig(total_timesteps=600, learning_rate=1e-5, min_learning_rate=1e-6,
-                       max_learning_rate=1e-5, **SMALL)
-    learn(lambda index: env(), config, run_dir=tmp_path, resume=True,
-          on_update=lambda _, row: rows.append(row["learning_rate"]))
-    assert rows and max(rows) <= 1e-5
-
-
-def test_run_folder(tmp_path):
-    model = run(tmp_path, 2, meta={"command": "train", "commit": "abc"})
-    names = {path.name for path in tmp_path.iterdir()}
-    assert names == {"config.json", "progress.csv", "checkpoint.pt", "curve.png"}
-    row = table(tmp_path)[-1]
-    assert {"update", "steps", "minutes", "steps_per_s", "collect_s", "learn_s", "return", "t_cr",
-            "success", "fall", "t_cr/left", "t_cr/right", "approx_kl", "clipfrac", "value_loss",
-            "explained_variance", "std", "guide_loss", "learning_rate",
-            "grad_norm"} == set(row)
-    # 8 of 20 steps more than a rollout: two rollouts of 32 end 3 episodes (21 rows each) per env.
-    assert int(row["steps"]) == 2 * 4 * 32 - 3 * 4
-    assert row["fall"] == "nan" and row["success"] == "1" and abs(float(row["t_cr"]) - 0.5) <= 1 / 8
-    assert float(row["t_cr"]) == pytest.approx(
-        sum(float(row[f"t_cr/{side}"]) for side in ("left", "right")) / 2, abs=0.1)
-    loaded, checkpoint = ppo.load_policy(tmp_path / "checkpoint.pt")
-    assert checkpoint["meta"] == {"command": "train", "commit": "abc"}
-    assert checkpoint["config"]["num_envs"] == 4
-    assert same_bits(states(loaded), states(model))
-
-
-def test_a_run_is_not_overwritten(tmp_path):
-    run(tmp_path, 1)
-    with pytest.raises(FileExistsError, match="already holds a run"):
-        run(tmp_path, 1)
-
-
-def test_resuming_needs_a_checkpoint_and_an_env_that_fits(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"checkpoint\.pt"):
-        run(tmp_path, 1, resume=True)
-    run(tmp_path, 1)
-    config = PPOConfig(total_timesteps=10_000, **SMALL)
-    with pytest.raises(ValueError, match="other columns"):
-        learn(lambda index: Probe(), config, run_dir=tmp_path, resume=True)
-    with pytest.raises(ValueError, match="obs_dim = 2, but the env has 6"):
-        learn(lambda index: Square(), PPOConfig(**SMALL), run_dir=tmp_path, resume=True)
-
-
-@pytest.mark.parametrize(("wrong", "named"), [
-    ({"resume": True}, "resume = True"),
-    ({"episode_keys": "t_cr"}, "'t_cr'"), ({"groups": "flat"}, "'flat'"),
-    ({"mirror": ([1, 2], [1, 1], [0], [1])}, r"\[1, 2\]"),
-])
-def test_bad_arguments_of_learn_are_named(wrong, named):
-    with pytest.raises(ValueError, match=named):
-        learn(lambda index: Probe(), PPOConfig(**SMALL), **wrong)
-
-
-def test_ctrl_c_finishes_the_update_and_keeps_it(tmp_path):
-    def interrupt(model, row):
-        if row["update"] == 3:
-            os.kill(os.getpid(), signal.SIGINT)
-
-    before = signal.getsignal(signal.SIGINT)
-    with pytest.raises(KeyboardInterrupt):
-        run(tmp_path, 99, on_update=interrupt)
-    assert signal.getsignal(signal.SIGINT) is before
-    assert ppo.load_checkpoint(tmp_path / "checkpoint.pt")["counters"]["update"] == 4
-    assert len(table(tmp_path)) == 4
-
-
-def test_policy_survives_the_checkpoint_and_is_small(tmp_path):
+def test_a_shared_policy_acts_alike_and_is_small(tmp_path):
     torch.manual_seed(0)
-    mirror = (range(200), [1] * 200, range(18), [1] * 18)
-    model = ActorCritic(200, 18, (8, 16), mirror=mirror)
-    model.update_normaliser(torch.randn(9, 200))
-    ppo.save_checkpoint(tmp_path / "p.pt", model, PPOConfig(), meta={"score": np.float64(0.5)})
-    loaded, checkpoint = ppo.load_policy(tmp_path / "p.pt")
-    obs = np.random.default_rng(0).normal(size=(3, 200)).astype(np.float32)
-    assert np.array_equal(loaded.mean_action(obs), model.mean_action(obs))
-    assert checkpoint["meta"] == {"score": 0.5}
-    assert (tmp_path / "p.pt").stat().st_size < 1_000_000
+    model = ActorCritic(200, 17, n_scan=160, init_std=(0.3,) * 5 + (0.5,) * 12)
+    torch.nn.init.normal_(model.actor.head.weight, std=0.3)
+    model.normaliser.update(torch.randn(99, 200) * 3 + 100)
+    ppo.save_policy(tmp_path / "p.pt", model, {"score": 0.5})
+    loaded, meta = ppo.load_policy(tmp_path / "p.pt")
+    obs = np.random.default_rng(0).normal(100, 3, (50, 200)).astype(np.float32)
+    action = model.mean_action(obs)
+    assert np.abs(action).max() > 0.5 and np.abs(loaded.mean_action(obs) - action).max() < 1e-3
+    assert meta == {"score": 0.5} and loaded.kwargs == model.kwargs
+    parameters = sum(p.numel() for p in model.actor.parameters())
+    assert (tmp_path / "p.pt").stat().st_size < 2 * parameters + 20_000
     assert [path.name for path in tmp_path.iterdir()] == ["p.pt"]
-    (tmp_path / "p.pt").rename(tmp_path / "checkpoint.pt")
-    with pytest.raises(ValueError, match="policy only"):
-        ppo.open_run(tmp_path, PPOConfig(), resume=True)
-    with pytest.raises(TypeError):
-        ppo.save_checkpoint(tmp_path / "q.pt", model, PPOConfig(), meta={"bad": object()})
-    assert not (tmp_path / "q.pt").exists()
 
 
-class Malicious:
+class Trap:
+    """Unpickled, it makes a directory."""
+
     def __reduce__(self):
-        return os.mkdir, (self.path,)
+        return os.mkdir, ("owned",)
 
 
-def test_bad_checkpoints_are_refused(tmp_path):
+def test_bad_checkpoints_are_refused_and_run_no_code(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     path = tmp_path / "bad.pt"
-    with pytest.raises(FileNotFoundError, match=r"bad\.pt"):
+    with pytest.raises(FileNotFoundError, match=r"no checkpoint at .*bad\.pt"):
         ppo.load_checkpoint(path)
-    ppo.save_checkpoint(path, ActorCritic(2, 1), PPOConfig())
+    ppo.save_policy(path, ActorCritic(2, 1), {})
     good = path.read_bytes()
-    trap = Malicious()
-    trap.path = str(tmp_path / "owned")
-    torch.save({"format": ppo.FORMAT, "x": trap}, tmp_path / "trap.pt")
-    for content in (b"", b"hello", good[: len(good) // 2], pickle.dumps(trap),
+    torch.save({"format": ppo.FORMAT, "x": Trap()}, tmp_path / "trap.pt")
+    for content in (b"", b"hello", good[: len(good) // 2], good[:-1], pickle.dumps(Trap()),
                     (tmp_path / "trap.pt").read_bytes()):
         path.write_bytes(content)
         with pytest.raises(ValueError, match=r"bad\.pt is damaged"):
-            ppo.load_checkpoint(path)
+            ppo.load_policy(path)
     assert not (tmp_path / "owned").exists()
-    torch.save({"weights": torch.zeros(2)}, path)
-    with pytest.raises(ValueError, match=r"bad\.pt is not a checkpoint"):
-        ppo.load_checkpoint(path)
-
-
-# --- the guide
-
-
-def test_guide_loss_by_hand():
-    mean = torch.tensor([[0.5, -0.5, 0.1], [0.0, 0.2, 0.3]], requires_grad=True)
-    advice = torch.tensor([[0.1, 0.5, math.nan], [math.nan, math.nan, math.nan]])
-    loss = ppo.guide_loss(mean, advice)
-    assert loss.tolist() == pytest.approx([1.4, 0.0])
-    loss.sum().backward()  # where there is no advice nothing pulls, and NaN does not spread
-    assert mean.grad.tolist() == [[1, -1, 0], [0, 0, 0]]
-
-
-def test_where_a_guide_turns_both_ways_the_policy_picks_the_more_frequent():
-    """Of 0.8, 0.8 and -0.8 the mean is 0.27, which nobody advised; the median is 0.8."""
-    mean = torch.zeros(3, 1, requires_grad=True)
-    for _ in range(100):
-        ppo.guide_loss(mean[:1].expand(3, 1), torch.tensor([[0.8], [0.8], [-0.8]])).sum().backward()
-        with torch.no_grad():
-            mean -= 0.01 * mean.grad
-        mean.grad = None
-    assert mean[0].item() == pytest.approx(0.8, abs=0.02)
-
-
-def test_a_guide_alone_may_lead_as_far_as_he_likes():
-    """A ratio that overflows is no concern of his: nothing of it reaches the parameters."""
-    torch.manual_seed(0)
-    model = ActorCritic(5, 2)
-    views, actions, log_prob, *rest, guide = rollout(model)
-    batch = [views, actions, log_prob - 1000, *rest, torch.full_like(guide, 0.5)]
-    config = PPOConfig(guide_share=1.0, target_kl=1e9, learning_rate=1e-3)
-    stats = [ppo_update(model, optimiser_of(model), batch, config, torch.Generator())
-             for _ in range(20)]
-    assert stats[-1]["guide_loss"] < stats[0]["guide_loss"]
-    assert all(torch.isfinite(p).all() for p in model.parameters())
-
-
-class Guided(Probe):
-    """Rewards are for nothing; the guide says what to do, but for every second episode."""
-
-    def told(self, info):
-        return info | {"guide": np.array([0.5 * self.obs[0] if self.obs[1] > 0 else np.nan])}
-
-    def reset(self, **kwargs):
-        obs, info = super().reset(**kwargs)
-        return obs, self.told(info)
-
-    def step(self, action):
-        *rest, info = super().step(action)
-        return *rest, self.told(info)
-
-
-@pytest.mark.parametrize("share", [1.0, 0.5])
-def test_the_policy_learns_what_its_guide_does(share):
-    config = PPOConfig(total_timesteps=6000, guide_share=share, target_kl=1.0, **SMALL)
-    rows = []
-    model = learn(lambda index: Guided(lambda *_: 0.0, length=3), config, episode_keys=(),
-                  on_update=lambda _, row: rows.append(row))
-    obs = np.array([[1.0, 1.0], [-1.0, 1.0]], np.float32)
-    assert model.mean_action(obs)[:, 0] == pytest.approx([0.5, -0.5], abs=0.1)
-    assert rows[-1]["guide_loss"] < 0.3 * rows[0]["guide_loss"]
-
-
-# --- two ranks
-
-
-def rank_main(rank, folder):
-    os.environ.update(RANK=str(rank), WORLD_SIZE="2", MASTER_ADDR="127.0.0.1",
-                      MASTER_PORT=(folder / "port").read_text())
-    # Episodes whose length depends on the env: the ranks have different numbers of reset rows.
-    env = lambda index: Probe(lambda obs, action, t: action, length=2 + 3 * index)  # noqa: E731
-    config = PPOConfig(total_timesteps=900, checkpoint_every=2, **SMALL)
-    torch.manual_seed(rank)  # the parameters must not depend on it
-    model = learn(env, config, run_dir=folder / "run", episode_keys=())
-    shared = one_update(slice(0, 20) if rank == 0 else slice(20, 64))
-    torch.save([states(model), model.count.item(), shared], folder / f"rank{rank}.pt")
-
-
-def one_update(rows):
-    """Statistics and first gradient step from some rows of a fixed rollout."""
-    torch.manual_seed(0)
-    model = ActorCritic(5, 2, (3, 1), (16,), (16,))
-    batch = [x[rows] for x in rollout(model)]  # without a mirror or statistics, views are obs
-    config = PPOConfig(update_epochs=1, num_minibatches=1)
-    stats = ppo_update(model, optimiser_of(model), batch, config, torch.Generator())
-    model.update_normaliser(batch[0][:, 0])
-    return [stats, model.actor.head.bias.grad.clone(), states(model)]
-
-
-def test_two_ranks_hold_the_same_bits(tmp_path):
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        (tmp_path / "port").write_text(str(free.getsockname()[1]))
-    mp.spawn(rank_main, (tmp_path,), nprocs=2)
-    (one, count, shared), (two, _, _) = (torch.load(tmp_path / f"rank{r}.pt") for r in (0, 1))
-    assert same_bits(one, two)
-    rows = table(tmp_path / "run")
-    assert count == int(rows[-1]["steps"]) >= 900  # both ranks' observations, reset rows left out
-    assert len(rows) < 900 / 100  # ... and both ranks' steps
-    # 20 rows on one rank and 44 on the other make the update that one rank makes of all 64.
-    (stats, gradient, state), alone = shared, one_update(slice(0, 64))
-    assert stats == pytest.approx(alone[0], abs=1e-6)
-    torch.testing.assert_close(gradient, alone[1])
-    for name in ("count", "obs_mean", "obs_sum_sq"):
-        torch.testing.assert_close(state[name], alone[2][name])
+    for foreign in ({"weights": torch.zeros(2)}, [1], {"format": "ppo checkpoint 1"}):
+        torch.save(foreign, path)
+        with pytest.raises(ValueError, match=r"bad\.pt is not a checkpoint of this program"):
+            ppo.load_policy(path)
