@@ -630,19 +630,23 @@ def launch(args):
     shared = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(store.port), "OMP_NUM_THREADS": "1",
               "WORLD_SIZE": str(n_ranks), "TORCHELASTIC_USE_AGENT_STORE": "True"}
     command = [sys.executable, __file__, *args.argv]
-    with Interrupt():  # ranks hear of Ctrl-C by themselves
-        with deaf():
-            ranks = [subprocess.Popen(command, env=os.environ | shared | {"RANK": str(rank)})
-                     for rank in range(n_ranks)]
-        while None in (codes := [rank.poll() for rank in ranks]) and not any(codes):
-            time.sleep(0.1)
-        for rank in ranks:  # where one fails, the others notice, or wait for it in vain
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                rank.wait(None if 130 in codes else 10)
-            rank.terminate()
-        codes = [rank.wait() for rank in ranks]
+    with deaf():
+        ranks = [subprocess.Popen(command, env=os.environ | shared | {"RANK": str(rank)})
+                 for rank in range(n_ranks)]
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+    try:
+        with Interrupt():  # ranks hear of Ctrl-C by themselves
+            while None in (codes := [rank.poll() for rank in ranks]) and not any(codes):
+                time.sleep(0.1)
+            for rank in ranks:  # where one fails, the others notice, or wait for it in vain
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    rank.wait(None if 130 in codes else 10)
+            codes = [rank.poll() or 0 for rank in ranks]
+    finally:
+        for rank in ranks:
+            rank.kill()
     for rank, code in enumerate(codes):
-        if code in (-signal.SIGKILL, -signal.SIGSEGV):
+        if code < 0:
             print(f"loco_mtrl.py: error: rank {rank} was killed by signal {-code}. "
                   f"To go on from the last checkpoint: {again(args)}", file=sys.stderr)
     return next((abs(code) for code in codes if code), 0)
@@ -693,7 +697,7 @@ def zero(observation):
 
 
 def straight(observation):
-    """Walks straight at the goal on the same trajectory generator: steers, but sees nothing."""
+    """Walks straight at the goal on the same trajectory generator. For a robot without LiDAR."""
     turn = 0.4 * np.clip(observation[1], -0.6, 0.6)
     return np.array([0.0, 0.75 - turn, 0.75 + turn, *[0.0] * 14])
 

@@ -11,6 +11,7 @@ Shapes: T = num_steps, N = environments of one rank, B = any batch.
 import contextlib
 import csv
 import fcntl
+import io
 import json
 import math
 import os
@@ -20,6 +21,7 @@ from collections import deque
 from dataclasses import asdict, dataclass
 from functools import partial
 from itertools import pairwise
+from numbers import Real
 from pathlib import Path
 
 import gymnasium as gym
@@ -53,7 +55,7 @@ class PPOConfig:
     max_advantage: float = 1.0
     max_grad_norm: float = 1.0  # for the actor and the critic, each on its own
     target_kl: tuple[float, float] = (0.03, 0.01)  # nats by which one update moves the policy
-    learning_rate: float = 5e-4  # the actor's step size at first; it then follows target_kl
+    learning_rate: float = 5e-4  # the actor's at first; then, in 1e-5 to 1e-3, it follows target_kl
     critic_learning_rate: float = 1e-3  # constant: the critic does not move the policy
     init_std: float | tuple[float, ...] = 0.37  # of the exploration noise; or one per action entry
     noise: tuple[float, float] = (1.0, 0.4)  # share of init_std that is in force
@@ -65,10 +67,13 @@ class PPOConfig:
     def __post_init__(self):
         for name, value in vars(self).items():
             least = 0 if name in ("gamma", "gae_lambda", "n_scan", "seed") else 1e-9
-            most = 1 if name in ("gamma", "gae_lambda") else 1e15
+            most = 1 if name in ("gamma", "gae_lambda") else 2**53
             values = value if isinstance(value, tuple) else (value,)
-            if not (values and all(least <= number <= most for number in values)):
-                raise ValueError(f"{name} = {value!r}, but it must be from {least:g} to {most:g}")
+            kind = int if isinstance(getattr(PPOConfig, name), int) or name == "hidden" else Real
+            fit = all(isinstance(number, kind) and least <= number <= most for number in values)
+            if not fit or not values or name in ("target_kl", "noise") and len(values) != 2:
+                raise ValueError(f"{name} = {value!r}, but it must be from {least:g} to {most:g}, "
+                                 f"like {getattr(PPOConfig, name)}")
 
 
 # ---------------------------------------------------------------- ranks
@@ -320,8 +325,9 @@ class Collector:
         And of the first key for each of `groups`, the values of info["task"]: "key/group".
         """
         known = {name: [e[name] for e in self.episodes if name in e] for name in ("return", *keys)}
-        for group in groups:
-            known[f"{keys[0]}/{group}"] = [e[keys[0]] for e in self.episodes if e["task"] == group]
+        for group in groups if keys else ():
+            known[f"{keys[0]}/{group}"] = [e[keys[0]] for e in self.episodes
+                                           if e.get("task") == group and keys[0] in e]
         sums = [[float(sum(values)), len(values)] for values in known.values()]
         sums = sum_over_ranks(torch.tensor(sums, dtype=torch.float64)).tolist()
         return {name: total / n if n else math.nan
@@ -367,6 +373,8 @@ def update(model, optimiser, rollout, config, generator, target_kl, mirror=None)
         advantages, returns = advantages.repeat(2), returns.repeat(2)
     with torch.no_grad():
         old_log_prob = model.log_prob(obs, actions)
+    if len(obs) < config.num_minibatches:
+        raise ValueError(f"{len(obs)} rows are too few for {config.num_minibatches} minibatches")
 
     for _epoch in range(config.update_epochs):
         stats = torch.zeros(3)  # value loss, approx_kl, clipfrac
@@ -385,9 +393,9 @@ def update(model, optimiser, rollout, config, generator, target_kl, mirror=None)
             break
     actor = optimiser.param_groups[0]
     if approx_kl > 2 * target_kl:
-        actor["lr"] = max(actor["lr"] / 1.5, 1e-5)
+        actor["lr"] = min(actor["lr"], max(actor["lr"] / 1.5, 1e-5))
     elif approx_kl < target_kl / 2:
-        actor["lr"] = min(actor["lr"] * 1.5, 1e-3)
+        actor["lr"] = max(actor["lr"], min(actor["lr"] * 1.5, 1e-3))
     # The critic's errors are the advantages, since returns = advantages + values.
     return {"approx_kl": approx_kl, "clipfrac": clipfrac, "value_loss": value_loss,
             "explained_variance": 1 - error / variance if variance > 0 else math.nan,
@@ -411,8 +419,10 @@ def descend(model, optimiser, loss, max_grad_norm):
 
 def write_whole(path, content):
     """torch.save, but `path` is whole or as it was, even if the power fails or the disk is full."""
+    buffer = io.BytesIO()  # torch's own words about a full disk are no OSError
+    torch.save(content, buffer)
     with open(f"{path}.tmp", "wb") as file:
-        torch.save(content, file)
+        file.write(buffer.getbuffer())
         file.flush()
         os.fsync(file.fileno())
     os.replace(f"{path}.tmp", path)
@@ -461,7 +471,7 @@ class RunFolder:
     another `meta`, and what load_checkpoint raises.
     """
 
-    def __init__(self, path, config, meta, resume):
+    def __init__(self, path, meta, resume):
         self.path, self.meta, self.checkpoint = Path(path), json.loads(json.dumps(meta)), None
         if resume:
             self.checkpoint = load_checkpoint(self.path / "checkpoint.pt")
@@ -473,17 +483,25 @@ class RunFolder:
         self.lock = open(self.path / "lock", "w")
         try:
             fcntl.flock(self.lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            self._drop_rows_after(self.checkpoint["counters"][0] if resume else 0)
         except BlockingIOError:
+            self.lock.close()
             raise BlockingIOError(f"another process is training in {path}") from None
-        text = json.dumps({"ppo": asdict(config), "meta": meta}, indent=2)
+        except BaseException:
+            self.lock.close()
+            raise
+
+    def note(self, config):
+        """Writes config.json."""
+        text = json.dumps({"ppo": asdict(config), "meta": self.meta}, indent=2)
         (self.path / "config.json").write_text(text + "\n")
-        self._drop_rows_after(self.checkpoint["counters"][0] if resume else 0)
 
     def _drop_rows_after(self, last):
         """From progress.csv: the updates after the checkpoint will be made again."""
         if (progress := self.path / "progress.csv").exists():
-            header, *rows = progress.read_text().splitlines(keepends=True) or [""]
-            rows = [row for row in rows if row.endswith("\n") and int(row.split(",")[0]) <= last]
+            header, *rows = progress.read_text(errors="replace").splitlines(keepends=True) or [""]
+            rows = [row for row in rows if row.endswith("\n") and row.split(",")[0].isdigit()]
+            rows = [row for row in rows if int(row.split(",")[0]) <= last]
             (self.path / "progress.tmp").write_text("".join([header, *rows] if rows else []))
             os.replace(self.path / "progress.tmp", progress)
 
@@ -512,13 +530,15 @@ class RunFolder:
             figure.savefig(self.path / "curve.png", dpi=100)
 
 
-def open_run(run_dir, config, meta, resume):
+def open_run(run_dir, meta, resume):
     """(RunFolder or None, checkpoint or None): rank 0 opens the folder, all know what it held."""
+    if resume and run_dir is None:
+        raise ValueError("resume = True, but there is no run_dir to go on from")
     run, found = None, [None]
     rank, world = join_ranks()
     if run_dir is not None and rank == 0:
         try:
-            run = RunFolder(run_dir, config, meta, resume)
+            run = RunFolder(run_dir, meta, resume)
             found = [run.checkpoint]
         except (OSError, ValueError, TypeError) as error:
             found = [error]
@@ -567,6 +587,7 @@ def make_model(config, collector, checkpoint):
                              f"asked for is {model.kwargs}")
         model.load_state_dict(checkpoint["model"])
         optimiser.load_state_dict(checkpoint["optimiser"])
+        optimiser.param_groups[1]["lr"] = config.critic_learning_rate
     return model, optimiser
 
 
@@ -575,6 +596,7 @@ def iterate(model, optimiser, collector, config, progress, mirror):
 
     While learning, the old and the new policy must see the same scale. progress: share of the
     training that is done. Returns a dict of numbers, columns of progress.csv, and how many steps.
+    Raises FloatingPointError if the parameters stop being numbers.
     """
     noise, target_kl = (first + progress * (last - first)
                         for first, last in (config.noise, config.target_kl))
@@ -602,32 +624,33 @@ def learn(make_env, config, *, run_dir=None, resume=False, mirror=None, meta=Non
             Gymnasium env with Box spaces. What the env gets is clipped to its action space, and the
             policy's mean lies in (-1, 1): other bounds need gymnasium.wrappers.RescaleAction.
         run_dir: folder of the run's files; None: no files. resume: go on from its checkpoint.
-        mirror: see `update`.
+        mirror: see `update`. episode_keys, groups: see Collector.averages.
         meta: plain dict kept in the checkpoint; a resumed run's must be equal.
-        episode_keys, groups: what of an episode's last info to average, see Collector.averages.
         on_update: called on rank 0 after every update as on_update(model, row of progress.csv).
         leg: function of the steps so far. When its value changes the leg is over: `learn` returns,
             and is to be called again, to resume, with new envs.
 
     At each checkpoint all envs are reset, and random numbers start afresh from (seed, update,
-    rank). So a checkpoint holds everything: going on from it gives the same bits as never having
-    stopped (with as many ranks, and envs that reset(seed) defines).
-
-    The first Ctrl-C stops after the running update, writes a checkpoint and raises
-    KeyboardInterrupt; a second one aborts. Raises FloatingPointError if the parameters stop being
-    numbers, and what RunFolder, Collector and ActorCritic raise.
+    rank). So going on from a checkpoint gives the same parameters, to the last bit, as never having
+    stopped (with as many ranks, and envs that reset(seed) defines). The first Ctrl-C stops after
+    the running update, with a checkpoint, by KeyboardInterrupt; a second one aborts. Also raises
+    FloatingPointError (see iterate), and what RunFolder, Collector and ActorCritic raise.
     """
     torch.set_num_threads(1)  # more threads only cost time on nets this small
     rank, world = join_ranks()
-    run, checkpoint = open_run(run_dir, config, meta, resume)
+    run, checkpoint = open_run(run_dir, meta, resume)
     n_updates, steps, minutes = checkpoint["counters"] if checkpoint else (0, 0, 0.0)
     this_leg, saved, stopped, total = leg(steps), True, False, config.total_timesteps
-    collector = Collector(partial(make_env, leg=this_leg), config.num_envs, rank, world)
-    model, optimiser = make_model(config, collector, checkpoint)
     shown = ["return", *episode_keys[:1]]
-    lock = run.lock if run else contextlib.nullcontext()
-    with (lock, contextlib.closing(collector.envs), Interrupt() as interrupt,
-          tqdm(total=total, initial=steps, unit="step", disable=rank > 0) as bar):
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(run.lock if run else contextlib.nullcontext())
+        collector = Collector(partial(make_env, leg=this_leg), config.num_envs, rank, world)
+        stack.enter_context(contextlib.closing(collector.envs))
+        model, optimiser = make_model(config, collector, checkpoint)
+        if run:
+            run.note(config)
+        interrupt = stack.enter_context(Interrupt())
+        bar = stack.enter_context(tqdm(total=total, initial=steps, unit="step", disable=rank > 0))
         while steps < total and leg(steps) == this_leg and not stopped:
             if saved:
                 collector.reset(config.seed, n_updates, rank)
@@ -648,6 +671,6 @@ def learn(make_env, config, *, run_dir=None, resume=False, mirror=None, meta=Non
                     run.save(model, optimiser, (n_updates, steps, minutes), shown)
             if on_update and rank == 0:
                 on_update(model, row)
-    if stopped:
+    if stopped or interrupt.came:
         raise KeyboardInterrupt
     return model, steps

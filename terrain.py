@@ -697,13 +697,13 @@ class World:
 
 WORLDS = {
     "maze": World(maze, dict(opened=0.6, corridor=1.5), (3, 6), (0, 1.58)),
-    "mountain": World(mountain, dict(faces=50, degrees=14), (6, 10), (1.32, 1.8), 0.035),
+    "mountain": World(mountain, dict(faces=60, degrees=14), (6, 10), (1.45, 2.0), 0.035),
     "office1": World(office1, dict(furniture=8), (3, 6), (0, 1.12)),
     "office2": World(office2, dict(furniture=20), (3.2, 6.2), (0, 1.18)),
-    "dynamic": World(dynamic, dict(furniture=12), (3, 6), (0, 1.16), people=5),
+    "dynamic": World(dynamic, dict(furniture=14), (3, 6), (0, 1.16), people=5),
     "forest": World(forest, dict(trunks=48), (6, 10)),
     "cliff": World(cliff, dict(swing=0.9), (4.5, 6.5)),
-    "continuous": World(continuous, dict(degrees=40), (6, 10), (1.18, 2.1), 0.035),
+    "continuous": World(continuous, dict(degrees=44), (6, 10), (1.3, 2.1), 0.035),
 }
 
 

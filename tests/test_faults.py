@@ -344,7 +344,7 @@ class Tiny(loco_mtrl.PPOConfig):
 
 sys.modules["matplotlib.figure"] = None
 loco_mtrl.PPOConfig, loco_mtrl.LAYOUTS, loco_mtrl.LEG = Tiny, 1, int(os.environ["LEG"])
-print("rank", os.getpid(), flush=True)
+os.write(1, f"rank {os.getpid()}\\n".encode())  # at once, lest the ranks' words mix
 sys.exit(loco_mtrl.main())
 """
 
