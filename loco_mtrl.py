@@ -8,6 +8,7 @@ Diverse Environments"; the sections named below are the paper's.
 import argparse
 import concurrent.futures
 import contextlib
+import copy
 import functools
 import itertools
 import json
@@ -99,7 +100,7 @@ SUBSTEPS, DT = 5, 1 / 30  # physics steps in a control step, and its length in s
 MAX_TORQUE = 40.0  # Nm
 # Bullet's implicit PD, per physics step. Compliant on purpose: stiff legs fall more often.
 POSITION_GAIN, VELOCITY_GAIN, SOLVER_ITERATIONS = 0.10, 1.0, 10
-STATIC_GROUP = 2  # Bullet's collision group of all that does not move by itself: rays see only it
+STATIC_GROUP = 2  # Bullet's collision group of bodies without mass: terrain and people
 PICTURE = 400, 300  # pixels, width and height of a rendered frame
 
 
@@ -192,7 +193,6 @@ class Simulation:
         raise TypeError("a simulation cannot be copied or pickled: make another environment")
 
     def load_robot(self):
-        """Loads a robot; a broken one before it is to be removed."""
         p = self.bullet
         with tempfile.NamedTemporaryFile("w", suffix=".urdf") as file:
             file.write(robot_urdf(self.visual))
@@ -231,14 +231,16 @@ class Simulation:
 
     def place(self, position, yaw, joints):
         """Puts the robot down, at rest. What happens next depends on nothing that was before."""
+        self._put((0, 0, 1000), yaw, joints)  # far away first: there Bullet forgets old contacts
+        self.step(joints)
+        self._put(position, yaw, joints)
+
+    def _put(self, position, yaw, joints):
         p = self.bullet
-        for place in ((0, 0, 1000), position):  # far away first: Bullet forgets old contacts
-            p.resetBasePositionAndOrientation(self.robot, place, _about_z(yaw))
-            p.resetBaseVelocity(self.robot, [0, 0, 0], [0, 0, 0])
-            for joint, angle in zip(self.joints, joints, strict=True):
-                p.resetJointState(self.robot, joint, angle)
-            if place is not position:
-                self.step(joints)
+        p.resetBasePositionAndOrientation(self.robot, position, _about_z(yaw))
+        p.resetBaseVelocity(self.robot, [0, 0, 0], [0, 0, 0])
+        for joint, angle in zip(self.joints, joints, strict=True):
+            p.resetJointState(self.robot, joint, angle)
 
     def step(self, targets):
         """One control step with the PD controllers' targets (12 joint angles, rad)."""
@@ -262,9 +264,9 @@ class Simulation:
         return self.bullet.rayTestBatch(*self._rays, parentObjectUniqueId=self.robot,
                                         parentLinkIndex=-1, collisionFilterMask=STATIC_GROUP)
 
-    def move_people(self, terrain, origin):
-        """Puts the bodies where the terrain's people are; those that it lacks, far below."""
-        for body, person in itertools.zip_longest(self.people, terrain.people):
+    def move_people(self, people, terrain, origin):
+        """Puts the bodies where people are on the terrain; those that are not needed, far below."""
+        for body, person in itertools.zip_longest(self.people, people):
             place, yaw = (0, 0, -1000), 0.0
             if person:
                 x, y, yaw = person.place()
@@ -306,7 +308,7 @@ class Part(NamedTuple):
     high: float
     image: list
     sign: list
-    std: float = 0.0  # of an action's exploration noise at first
+    std: float  # of an action's exploration noise at first
 
 
 def _part(name, low, high, image, sign=1, std=0.0):
@@ -320,18 +322,16 @@ SWAP_STRIDES = [0, 2, 1, 3, 4]
 
 def observation_parts(tg=True, lidar=True):
     """What an observation consists of, in its order (section 2.1)."""
-    parts = [
-        _part("LiDAR scan, sqrt(distance / 5 m)", 0, 1,
-              np.arange(N_RAYS).reshape(SCAN_SHAPE)[:, ::-1]),
-        _part("distance to the goal, m", 0, 1e3, [0]),
-        _part("heading of the goal, left positive, rad", -math.pi, math.pi, [0], -1),
-        _part("angular rates of the base, rad/s", -1e3, 1e3, [0, 1, 2], [-1, 1, -1]),
-        _part("joint angles, rad", -1e2, 1e2, SWAP_LEGS),
-        _part("last commanded joint angles, rad", -1e2, 1e2, SWAP_LEGS),
-        _part("TG: cosine and sine of each leg's phase", -1, 1, [1, 0, 3, 2, 5, 4, 7, 6]),
-        _part("TG: parameters in force", -1, 1, SWAP_STRIDES),
-    ]
-    return parts[not lidar : len(parts) - 2 * (not tg)]
+    eyes = [_part("LiDAR scan, sqrt(distance / 5 m)", 0, 1,
+                  np.arange(N_RAYS).reshape(SCAN_SHAPE)[:, ::-1])]
+    body = [_part("distance to the goal, m", 0, 1e3, [0]),
+            _part("heading of the goal, left positive, rad", -math.pi, math.pi, [0], -1),
+            _part("angular rates of the base, rad/s", -1e3, 1e3, [0, 1, 2], [-1, 1, -1]),
+            _part("joint angles, rad", -1e2, 1e2, SWAP_LEGS),
+            _part("last commanded joint angles, rad", -1e2, 1e2, SWAP_LEGS)]
+    gait = [_part("TG: cosine and sine of each leg's phase", -1, 1, [1, 0, 3, 2, 5, 4, 7, 6]),
+            _part("TG: parameters in force", -1, 1, SWAP_STRIDES)]
+    return (eyes if lidar else []) + body + (gait if tg else [])
 
 
 def action_parts(tg=True):
@@ -343,8 +343,9 @@ def action_parts(tg=True):
 
 
 def box(parts):
-    low, high = ([part[k] for part in parts for _ in range(part.size)] for k in (2, 3))
-    return gymnasium.spaces.Box(np.float32(low), np.float32(high))
+    """The Gymnasium space of all parts."""
+    bounds = np.float32([(part.low, part.high) for part in parts for _ in range(part.size)])
+    return gymnasium.spaces.Box(*bounds.T)
 
 
 def mirror(parts):
@@ -371,8 +372,8 @@ class LocoEnv(gymnasium.Env):
     calls it the velocity toward the target.
 
     ## Episode
-    It terminates at the goal (base within 0.5 m) and in a fall (base tipped by over 60 degrees or
-    dropping faster than 2.5 m/s: both break a real robot). The time limit is the wrapper's.
+    It terminates at the goal (base within GOAL_RADIUS) and in a fall (FALL_UP, FALL_SPEED: what
+    breaks a real robot), looked for after each decision. The time limit is the wrapper's.
 
     `info` holds task, t_cr = 1 - d_T / d_0 in [0, 1] (1 at the goal), success, fall, collisions:
     how often the robot has bumped into a person, and exploded: that the simulation broke down,
@@ -444,9 +445,8 @@ class LocoEnv(gymnasium.Env):
             self.generator.reset(rng.uniform(0, 2 * np.pi))
             self.target = self.generator.step(self.action[:-12], 0.0)
         position = np.add(self.origin, (x, y, z + BASE_HEIGHT + 0.02)).tolist()
-        for person in self.terrain.people:
-            person.reset()
-        self.simulation.move_people(self.terrain, self.origin)
+        self.people = copy.deepcopy(self.terrain.people)
+        self.simulation.move_people(self.people, self.terrain, self.origin)
         self.simulation.place(position, yaw + rng.uniform(-0.5, 0.5), self.target)
         self.collisions, self.touching, self.seconds = 0, False, 0.0
         self.robot = self.simulation.sense()
@@ -464,7 +464,7 @@ class LocoEnv(gymnasium.Env):
         before = self._distance(self.robot)
         for _ in range(HOLD):
             self._control(action)
-        if self.terrain.people:
+        if self.people:
             touching = self.simulation.touches_people()
             self.collisions += touching and not self.touching
             self.touching = touching
@@ -491,11 +491,11 @@ class LocoEnv(gymnasium.Env):
         self.target = [u + self.residual * a for u, a in pairs]  # u_tg + u_fb
         self.simulation.step(self.target)
         self.seconds += DT
-        if self.terrain.people:
+        if self.people:
             x, y, _ = np.subtract(self.robot.position, self.origin)
-            for person in self.terrain.people:
+            for person in self.people:
                 person.walk(DT, (x, y))
-            self.simulation.move_people(self.terrain, self.origin)
+            self.simulation.move_people(self.people, self.terrain, self.origin)
 
     def _distance(self, robot):
         """From the robot's base to the goal, m."""
@@ -505,7 +505,7 @@ class LocoEnv(gymnasium.Env):
         """The observation, whose order is that of `observation_parts`, (n_obs,) float32."""
         robot, scan = self.robot, []
         if self.lidar:
-            # The root: as fine as a scan of 3 m is near by, and yet it looks across a room.
+            # The root spends most of the range [0, 1] on what is near, and still sees 5 m far.
             scan = [math.sqrt(hit[2]) for hit in self.simulation.scan()]
         dx, dy, _ = np.subtract(self.goal, robot.position).tolist()
         heading = math.remainder(math.atan2(dy, dx) - robot.yaw, 2 * math.pi)
@@ -554,7 +554,7 @@ def make_env(tasks, seconds=30, **options):
 
 # ------------------------------------------------------------------------------- train
 
-REWARD_SCALE = 0.1  # keeps the critic's targets near 1
+REWARD_SCALE = HOLD * DT  # rewards in metres of progress keep the critic's targets near 1
 LAYOUTS = 8  # terrains of each training environment, in one leg
 LEG = 400_000  # steps; then every process starts itself afresh, on new layouts
 
@@ -562,8 +562,8 @@ LEG = 400_000  # steps; then every process starts itself afresh, on new layouts
 def training_env(index, leg, args):
     """Environment number `index` over all ranks, in leg (number, task): one task, new layouts.
 
-    Every environment keeps to one task, so all tasks have the same share of every batch. One task
-    after the other (--sequential), the leg's task has all environments.
+    Each of the 32 environments keeps to one of the 16 tasks, so all tasks have the same share of
+    every batch. With --sequential the leg's task has all environments.
     """
     number, k = leg
     task = args.tasks[k if args.sequential else index % len(args.tasks)]
@@ -586,6 +586,7 @@ def train(args):
     first, run_dir = os.environ["RANK"] == "0", Path(args.run_dir)
     legs, checkpoint = int(os.environ.get("PPO_LEG", 0)), run_dir / "checkpoint.pt"
     crashed = os.environ.get("TORCHELASTIC_RESTART_COUNT", "0") != "0"  # torchrun starts us again
+    # Ablations change what is observed, what is commanded or which task comes when: nothing else.
     meta = {name: getattr(args, name) for name in ("tg", "lidar", "tasks", "sequential", "seed")}
     observation, action = observation_parts(args.tg, args.lidar), action_parts(args.tg)
     config = PPOConfig(

@@ -37,7 +37,7 @@ FORMAT = "ppo checkpoint 2"
 
 @dataclass(frozen=True)
 class PPOConfig:
-    """Every number PPO needs; the defaults are the recipe of the main job.
+    """The settings of PPO; the defaults are the main job's, to which `train` adds n_scan, init_std.
 
     Of two values the first holds at the beginning of the training and the second at its end; in
     between it falls linearly. Raises ValueError that names a bad value.
@@ -51,7 +51,7 @@ class PPOConfig:
     update_epochs: int = 3  # passes over each rollout
     num_minibatches: int = 8  # gradient steps per pass
     clip_coef: float = 0.2  # a probability ratio earns nothing outside 1 +- clip_coef
-    # Largest advantage, in standard deviations: a few falls would fill the gradient with noise.
+    # Advantages are cut there, in standard deviations: otherwise a few falls would drown the rest.
     max_advantage: float = 1.0
     max_grad_norm: float = 1.0  # for the actor and the critic, each on its own
     target_kl: tuple[float, float] = (0.03, 0.01)  # nats by which one update moves the policy
@@ -340,7 +340,8 @@ class Collector:
 def with_images(x, index, sign):
     """Every row and, after them, every row's left-right mirror image: (B, D) -> (2 B, D).
 
-    The image of a row x is x[index] * sign.
+    Robot, tasks and reward are alike on both sides, so an image is as good an experience. The
+    image of a row x is x[index] * sign.
     """
     return torch.cat((x, x[:, torch.as_tensor(index)] * torch.as_tensor(sign, dtype=x.dtype)))
 
@@ -367,7 +368,7 @@ def update(model, optimiser, rollout, config, generator, target_kl, mirror=None)
     (mean, error), (_, variance) = moments(advantages), moments(returns)
     advantages = (advantages - mean) / (math.sqrt(error) + 1e-8)
     advantages = advantages.clamp(-config.max_advantage, config.max_advantage)
-    advantages = advantages - moments(advantages)[0]
+    advantages = advantages - moments(advantages)[0]  # the cut has moved the mean
     if mirror:
         obs, actions = with_images(obs, *mirror[0]), with_images(actions, *mirror[1])
         advantages, returns = advantages.repeat(2), returns.repeat(2)
@@ -640,7 +641,7 @@ def learn(make_env, config, *, run_dir=None, resume=False, mirror=None, meta=Non
     rank, world = join_ranks()
     run, checkpoint = open_run(run_dir, meta, resume)
     n_updates, steps, minutes = checkpoint["counters"] if checkpoint else (0, 0, 0.0)
-    this_leg, saved, stopped, total = leg(steps), True, False, config.total_timesteps
+    this_leg, fresh, stopped, total = leg(steps), True, False, config.total_timesteps
     shown = ["return", *episode_keys[:1]]
     with contextlib.ExitStack() as stack:
         stack.enter_context(run.lock if run else contextlib.nullcontext())
@@ -652,7 +653,7 @@ def learn(make_env, config, *, run_dir=None, resume=False, mirror=None, meta=Non
         interrupt = stack.enter_context(Interrupt())
         bar = stack.enter_context(tqdm(total=total, initial=steps, unit="step", disable=rank > 0))
         while steps < total and leg(steps) == this_leg and not stopped:
-            if saved:
+            if fresh:
                 collector.reset(config.seed, n_updates, rank)
             stats, seen = iterate(model, optimiser, collector, config, steps / total, mirror)
             sums = sum_over_ranks(torch.tensor([seen, interrupt.came], dtype=torch.float64))
@@ -661,13 +662,13 @@ def learn(make_env, config, *, run_dir=None, resume=False, mirror=None, meta=Non
             minutes += (stats["collect_s"] + stats["learn_s"]) / 60
             row = {"update": n_updates, "steps": steps, "minutes": minutes,
                    **collector.averages(episode_keys, groups), **stats}
-            saved = (n_updates == 1 or n_updates % config.checkpoint_every == 0 or stopped
+            fresh = (n_updates == 1 or n_updates % config.checkpoint_every == 0 or stopped
                      or steps >= total or leg(steps) != this_leg)
             bar.update(new_steps)
             bar.set_postfix({name: f"{row[name]:.3g}" for name in shown})
             if run:
                 run.log(row)
-                if saved:
+                if fresh:
                     run.save(model, optimiser, (n_updates, steps, minutes), shown)
             if on_update and rank == 0:
                 on_update(model, row)

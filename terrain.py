@@ -73,7 +73,7 @@ class Person:
 
 @dataclass(frozen=True, eq=False)
 class Terrain:
-    """One place to walk in: a triangle mesh, routes over it, the heights for who must know them.
+    """One place to walk in: a mesh, routes over it, and heights, which the robot never reads.
 
     An episode draws one k: it begins at `starts[k]`, mostly facing its own goal, `goals[k]`.
     """
@@ -291,7 +291,7 @@ SPAN = U.max()  # m, 8.4
 
 
 def _barrier(difficulty):
-    """Height of a wall, or depth of a drop, m: from a third of the difficulty on it stops all."""
+    """Height of a wall or depth of a drop, m: a step up to difficulty 0.05, 1.2 m from 0.3 on."""
     return min(1.2, 4 * difficulty)
 
 
@@ -691,19 +691,20 @@ class World:
     numbers: dict
     goal: tuple[float, float]  # least and most distance of the goal, m
     detour: tuple[float, float] = (0, np.inf)  # least and most length of the way, in distances
-    climb: float = LEVEL  # m, highest step on the way; on a smooth surface, 10 times the slope
+    climb: float = LEVEL  # m, highest step on the way; 0.04 is a slope of 22 degrees
+    floor: float = -np.inf  # m, least height of start and goal
     people: int = 0
 
 
 WORLDS = {
-    "maze": World(maze, dict(opened=0.6, corridor=1.5), (3, 6), (0, 1.58)),
+    "maze": World(maze, dict(opened=0.5, corridor=1.5), (3.3, 6.3), (0, 1.58)),
     "mountain": World(mountain, dict(faces=60, degrees=14), (6, 10), (1.45, 2.0), 0.035),
     "office1": World(office1, dict(furniture=8), (3, 6), (0, 1.12)),
-    "office2": World(office2, dict(furniture=20), (3.2, 6.2), (0, 1.18)),
+    "office2": World(office2, dict(furniture=20), (3.5, 6.5), (0, 1.18)),
     "dynamic": World(dynamic, dict(furniture=14), (3, 6), (0, 1.16), people=5),
-    "forest": World(forest, dict(trunks=48), (6, 10)),
-    "cliff": World(cliff, dict(swing=0.9), (4.5, 6.5)),
-    "continuous": World(continuous, dict(degrees=44), (6, 10), (1.3, 2.1), 0.035),
+    "forest": World(forest, dict(trunks=63), (6, 10)),
+    "cliff": World(cliff, dict(swing=0.9), (4.5, 6.5), floor=-0.5),
+    "continuous": World(continuous, dict(degrees=42), (6, 10), (1.25, 2.4), 0.04),
 }
 
 
@@ -722,8 +723,7 @@ def make_world(name, seed, **changes):
     for _ in range(DRAWS):
         plan, meshes = world.build(rng, **world.numbers)
         nav = Navigation(plan, CELL, world.climb)
-        floor = -0.5 if world.build is cliff else -np.inf  # nobody starts below the cliff
-        routes = find_routes(nav, rng, 1, world.goal, world.detour, floor=floor)
+        routes = find_routes(nav, rng, 1, world.goal, world.detour, floor=world.floor)
         people = [_person(rng, nav, routes[0][0]) for _ in range(world.people) if routes]
         if routes and None not in people:
             return Terrain(name, *join(meshes), *routes, plan, CELL, world.climb, people)

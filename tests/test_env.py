@@ -220,7 +220,7 @@ def test_a_person_stops_before_the_robot_and_turns_back():
         places = []
         for _ in range(45):
             *_, info = env.step(np.zeros(12))
-            places.append(env.terrain.people[0].place()[0])
+            places.append(env.people[0].place()[0])
             assert not info["fall"] and info["collisions"] == 0
         assert abs(min(places) - 4.1) < 0.05 and places[-1] > 4.5
         assert 29 <= np.isclose(places, min(places)).sum() <= 32

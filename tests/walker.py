@@ -60,7 +60,7 @@ class Walker:
         turn = math.remainder(math.atan2(to[1] - y, to[0] - x) - env.robot.yaw, 2 * math.pi)
         action = np.zeros(17)
         forward = 0.21 * max(0.0, math.cos(turn)) ** 2
-        for person in env.terrain.people:
+        for person in env.people:
             px, py, _ = person.place()
             ahead = math.cos(env.robot.yaw) * (px - x) + math.sin(env.robot.yaw) * (py - y)
             if 0 < ahead < 1.2 and math.hypot(px - x, py - y) < 1.2:
