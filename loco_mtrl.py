@@ -35,6 +35,7 @@ from ppo import Interrupt, PPOConfig, learn, load_policy, save_policy
 from terrain import (
     PILLAR_TASKS,
     WORLDS,
+    Navigation,
     Person,
     Terrain,
     load_scan,
@@ -833,7 +834,7 @@ def check_writable(path):
 
 
 def draw_map(axis, terrain):
-    """Draws a terrain from above: heights, starts (white), goals (green), ways, people's ways."""
+    """Draws a terrain from above: heights, starts, goals (green), a world's way, people's ways."""
     from matplotlib import colormaps
     from matplotlib.colors import LightSource
 
@@ -845,6 +846,10 @@ def draw_map(axis, terrain):
     axis.imshow(shaded, origin="lower", extent=(0, length, -width / 2, width / 2))
     for person in terrain.people:
         axis.plot(*person.path.T, color="tab:orange", lw=1)
+    if len(terrain.starts) == 1:
+        nav = Navigation(terrain.heights, terrain.cell, terrain.climb)
+        ends = (nav.cell(*place[0, :2]) for place in (terrain.starts, terrain.goals))
+        axis.plot(*nav.way(*ends).T, "w:", lw=1.5)
     axis.plot(*terrain.starts[:, :2].T, "wo", ms=5, mec="k")
     axis.plot(*terrain.goals[:, :2].T, "o", color="tab:green", ms=5, mec="k")
     axis.set(xticks=[], yticks=[])

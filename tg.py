@@ -85,7 +85,6 @@ class TrajectoryGenerator:
     go in circles around the robot's middle. In swing it returns, lifted along half a sine.
     `phase`, rad, is common to all legs. `scaled` are the 5 parameters in force, in [-1, 1].
     """
-
     action_size = len(PARAMETERS)
 
     def __init__(self):
