@@ -21,6 +21,7 @@ STEP = 0.2  # m, highest step that Laikago's feet clear: what training may ask f
 LEVEL = 0.05  # m, highest step on a level way; most that a start may be uneven
 PAD = 9  # pillars, depth of the flat strips at both ends, where most episodes start (1.8 m)
 ROUTES = 8  # start and goal pairs per training terrain
+MAX_VERTICES, MAX_INDICES = 131_072, 524_288  # what PyBullet takes in one mesh
 DRAWS, TRIES = 60, 10  # of a layout, and of a start in it, before it is said to have no route
 
 # ---------------------------------------------------------------- what a terrain is
@@ -140,6 +141,13 @@ def fuse_pillars(heights, cell):
     x0, x1 = i * cell, (i + 1) * cell
     along = _quads((x0, y, z0), (x1, y, z0), (x1, y, z1), (x0, y, z1))
     return join([tops, across, along])
+
+
+def check_size(name, vertices, triangles):
+    """Raises ValueError if PyBullet does not take a mesh, for it would not say why."""
+    if len(vertices) > MAX_VERTICES or triangles.size > MAX_INDICES:
+        raise ValueError(f"{name} is too large for PyBullet: {len(vertices)} vertices (at most "
+                         f"{MAX_VERTICES}), {triangles.size} indices (at most {MAX_INDICES})")
 
 
 def triangulate(nodes, cell):
@@ -458,7 +466,7 @@ def make_terrain(task, rng, difficulty):
     A function may have attributes: `cell`, m, the pillars' cross-section if it is not L, and
     `fence`, walls along the border that grow with difficulty.
     Raises ValueError for an unknown task, a difficulty outside [0, 1], heights that are not a
-    finite 2-D array, and a task that yields no route in DRAWS draws.
+    finite 2-D array or too many for PyBullet, and a task that yields no route in DRAWS draws.
     """
     if isinstance(task, Terrain):
         return task
@@ -486,7 +494,9 @@ def make_terrain(task, rng, difficulty):
         if routes:
             # Some begin with their back to the goal: what lies behind it is worth a look, too.
             routes[0][2::3, 3] += rng.uniform(-np.pi, np.pi, len(routes[0][2::3]))
-            return Terrain(name, *fuse_pillars(heights, cell), *routes, heights, cell)
+            mesh = fuse_pillars(heights, cell)
+            check_size(name, *mesh)
+            return Terrain(name, *mesh, *routes, heights, cell)
     raise ValueError(f"task {name!r} gave no walkable route in {DRAWS} draws of {heights.shape}")
 
 
@@ -751,7 +761,6 @@ def _person(rng, nav, start):
 HEADROOM = 7  # CELLs, least clearance over a floor
 WINDOW = 20.0  # m, from the middle of a scan in x and y to where the rest is cut off
 MAX_SIZE = 1000.0  # m, of a scan: more is a mistake in its scale
-MAX_VERTICES, MAX_INDICES = 131_072, 524_288  # what PyBullet takes in one mesh
 
 
 def read_scan(path, scale, up):
@@ -775,9 +784,7 @@ def read_scan(path, scale, up):
     mesh = trimesh.Trimesh(*parts)
     mesh.update_faces((np.abs(mesh.triangles_center[:, :2]) < WINDOW).all(1))
     mesh.remove_unreferenced_vertices()
-    if len(mesh.vertices) > MAX_VERTICES or mesh.faces.size > MAX_INDICES:
-        raise ValueError(f"{path} is too large for PyBullet: {len(mesh.vertices)} vertices (at most"
-                         f" {MAX_VERTICES}), {mesh.faces.size} indices (at most {MAX_INDICES})")
+    check_size(path, mesh.vertices, mesh.faces)
     return mesh
 
 

@@ -745,3 +745,12 @@ def test_without_trimesh_the_error_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "trimesh", None)
     with pytest.raises(ImportError, match="trimesh.*pip install"):
         load_scan(path)
+
+
+def test_own_terrains_beyond_pybullets_limit_are_named():
+    def gravel(rng, difficulty):
+        return rng.uniform(0, 0.04, (240, 160))
+
+    gravel.cell = 0.05
+    with pytest.raises(ValueError, match="gravel is too large for PyBullet"):
+        make_terrain(gravel, np.random.default_rng(0), 0.5)
