@@ -31,7 +31,7 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from ppo import Interrupt, PPOConfig, learn, load_policy, save_policy
+from ppo import PPOConfig, learn, load_policy, note_interrupt, save_policy
 from terrain import (
     PILLAR_TASKS,
     WORLDS,
@@ -556,27 +556,28 @@ def make_env(tasks, seconds=30, **options):
 # ------------------------------------------------------------------------------- train
 
 REWARD_SCALE = HOLD * DT  # rewards in metres of progress keep the critic's targets near 1
-LAYOUTS = 8  # terrains of each training environment, in one leg
-LEG = 400_000  # steps; then every process starts itself afresh, on new layouts
+LAYOUTS = 8  # terrains of each training environment
+STAGE = 400_000  # steps; then every process starts itself afresh, on new layouts
 
 
-def training_env(index, leg, args):
-    """Environment number `index` over all ranks, in leg (number, task): one task, new layouts.
+def stage(steps, args):
+    """Where a step lies: (new layouts so far, index of the task with --sequential, last step)."""
+    n = len(args.tasks) if args.sequential else 1
+    layouts, task = steps // STAGE, min(n * steps // args.steps, n - 1)
+    return layouts, task, min((layouts + 1) * STAGE, math.ceil((task + 1) * args.steps / n))
 
-    Each of the 32 environments keeps to one of the 16 tasks, so all tasks have the same share of
-    every batch. With --sequential the leg's task has all environments.
+
+def training_env(index, steps, args):
+    """Environment number `index` over all ranks, in the stage that begins at `steps`: one task.
+
+    Each of the 34 environments keeps to one of the 17 tasks, so all tasks have the same share of
+    every batch. With --sequential the stage's task has all environments.
     """
-    number, k = leg
+    layouts, k, _ = stage(steps, args)
     task = args.tasks[k if args.sequential else index % len(args.tasks)]
     env = make_env(task, tg=args.tg, lidar=args.lidar, layouts=LAYOUTS,
-                   pool_seed=(args.seed, number, k, index))
+                   pool_seed=(args.seed, layouts, k, index))
     return gymnasium.wrappers.TransformReward(env, lambda reward: REWARD_SCALE * reward)
-
-
-def leg_of(steps, args):
-    """The leg to which a step belongs: (number, index of the task with --sequential, else 0)."""
-    n = len(args.tasks) if args.sequential else 1
-    return steps // LEG, min(n * steps // args.steps, n - 1)
 
 
 def train(args):
@@ -585,7 +586,7 @@ def train(args):
         return launch(args)
     signal.signal(signal.SIGINT, signal.default_int_handler)
     first, run_dir = os.environ["RANK"] == "0", Path(args.run_dir)
-    legs, checkpoint = int(os.environ.get("PPO_LEG", 0)), run_dir / "checkpoint.pt"
+    stages, checkpoint = int(os.environ.get("PPO_STAGE", 0)), run_dir / "checkpoint.pt"
     crashed = os.environ.get("TORCHELASTIC_RESTART_COUNT", "0") != "0"  # torchrun starts us again
     # Ablations change what is observed, what is commanded or which task comes when: nothing else.
     meta = {name: getattr(args, name) for name in ("tg", "lidar", "tasks", "sequential", "seed")}
@@ -595,10 +596,10 @@ def train(args):
         init_std=tuple(part.std for part in action for _ in range(part.size)))
     try:
         model, steps = learn(
-            functools.partial(training_env, args=args), config, run_dir=run_dir,
-            resume=args.resume or legs > 0 or crashed and checkpoint.exists(), meta=meta,
-            mirror=(mirror(observation), mirror(action)), leg=functools.partial(leg_of, args=args),
-            episode_keys=("t_cr", "success", "fall", "exploded"), groups=args.tasks,
+            functools.partial(training_env, args=args), config, run_dir=run_dir, meta=meta,
+            resume=args.resume or stages > 0 or crashed and checkpoint.exists(),
+            mirror=(mirror(observation), mirror(action)), stage_end=lambda n: stage(n, args)[2],
+            episode_keys=("t_cr", "success", "fall", "exploded"),
             on_update=tensorboard(run_dir) if args.tensorboard and first else None)
     except KeyboardInterrupt:
         if first:
@@ -607,12 +608,27 @@ def train(args):
     if steps < args.steps:  # Bullet gives no memory back but to a new process
         if torch.distributed.is_initialized():
             torch.distributed.destroy_process_group()
-        os.environ["PPO_LEG"] = str(legs + 1)
+        os.environ["PPO_STAGE"] = str(stages + 1)
         os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
     if first:
         save_policy(run_dir / "policy.pt", model, meta)
+        draw_curve(run_dir)
         print(f"Policy: {run_dir}/policy.pt   Curve: {run_dir}/curve.png")
     return 0
+
+
+def draw_curve(run_dir):
+    """Writes curve.png, t_cr of training against minutes, where matplotlib is installed."""
+    try:
+        from matplotlib.figure import Figure  # not pyplot: a notebook keeps its backend
+    except ImportError:
+        return
+    figure = Figure(figsize=(5, 3), layout="constrained")
+    rows = np.genfromtxt(run_dir / "progress.csv", delimiter=",", names=True, ndmin=1)
+    axis = figure.subplots()
+    axis.plot(rows["minutes"], rows["t_cr"])
+    axis.set(xlabel="minutes", ylabel="t_cr", ylim=(0, 1))
+    figure.savefig(run_dir / "curve.png", dpi=100)
 
 
 @contextlib.contextmanager
@@ -637,7 +653,7 @@ def launch(args):
                  for rank in range(n_ranks)]
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
     try:
-        with Interrupt():  # ranks hear of Ctrl-C by themselves
+        with note_interrupt():  # ranks hear of Ctrl-C by themselves
             while None in (codes := [rank.poll() for rank in ranks]) and not any(codes):
                 time.sleep(0.1)
             for rank in ranks:  # where one fails, the others notice, or wait for it in vain

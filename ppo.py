@@ -2,14 +2,13 @@
 
 Read it from top to bottom: the settings, the networks, two pure functions that hold the theory
 (`compute_gae`, `ppo_loss`), `Collector`, which gathers experience, `update`, which learns from it,
-the files of a run, and `learn`, the loop around them. It runs in one process or in many ("ranks"),
-which `loco_mtrl.py` or torchrun starts, on one machine or several.
+and `learn`, the loop around them. It runs in one process or in many ("ranks"), which torchrun
+starts, on one machine or several.
 
 Shapes: T = num_steps, N = environments of one rank, B = any batch.
 """
 
 import contextlib
-import csv
 import fcntl
 import io
 import json
@@ -21,7 +20,6 @@ from collections import deque
 from dataclasses import asdict, dataclass
 from functools import partial
 from itertools import pairwise
-from numbers import Real
 from pathlib import Path
 
 import gymnasium as gym
@@ -32,7 +30,7 @@ from torch import nn
 from torch.nn.utils import clip_grad_norm_, parameters_to_vector, vector_to_parameters
 from tqdm import tqdm
 
-FORMAT = "ppo checkpoint 2"
+FORMAT = "ppo checkpoint 3"
 
 
 @dataclass(frozen=True)
@@ -44,7 +42,7 @@ class PPOConfig:
     """
 
     total_timesteps: int = 600_000  # environment steps over all ranks, resets not counted
-    num_envs: int = 32  # environments over all ranks
+    num_envs: int = 34  # environments over all ranks
     num_steps: int = 128  # steps of each environment between two updates
     gamma: float = 0.995  # discount per step
     gae_lambda: float = 0.95  # 0: one-step TD, little variance; 1: Monte Carlo, no bias
@@ -66,14 +64,11 @@ class PPOConfig:
 
     def __post_init__(self):
         for name, value in vars(self).items():
-            least = 0 if name in ("gamma", "gae_lambda", "n_scan", "seed") else 1e-9
+            least = 0 if name in ("gamma", "gae_lambda", "noise", "n_scan", "seed") else 1e-9
             most = 1 if name in ("gamma", "gae_lambda") else 2**53
-            values = value if isinstance(value, tuple) else (value,)
-            kind = int if isinstance(getattr(PPOConfig, name), int) or name == "hidden" else Real
-            fit = all(isinstance(number, kind) and least <= number <= most for number in values)
-            if not fit or not values or name in ("target_kl", "noise") and len(values) != 2:
-                raise ValueError(f"{name} = {value!r}, but it must be from {least:g} to {most:g}, "
-                                 f"like {getattr(PPOConfig, name)}")
+            values = np.atleast_1d(value)
+            if not len(values) or not ((least <= values) & (values <= most)).all():
+                raise ValueError(f"{name} must be from {least:g} to {most:g}, got {value!r}")
 
 
 # ---------------------------------------------------------------- ranks
@@ -83,8 +78,8 @@ def join_ranks():
     """(rank, number of ranks): meets the other processes of RANK and WORLD_SIZE, if there are."""
     if int(os.environ.get("WORLD_SIZE", 1)) > 1 and not dist.is_initialized():
         store, rank, world = next(dist.rendezvous("env://"))
-        # After a crash and in a new leg the store is the same: the old addresses are not.
-        restart = os.environ.get("TORCHELASTIC_RESTART_COUNT"), os.environ.get("PPO_LEG")
+        # After a crash and in a new stage the store is the same: the old addresses are not.
+        restart = os.environ.get("TORCHELASTIC_RESTART_COUNT"), os.environ.get("PPO_STAGE")
         store = dist.PrefixStore(str(restart), store)
         dist.init_process_group("gloo", store=store, rank=rank, world_size=world)
     return (dist.get_rank(), dist.get_world_size()) if dist.is_initialized() else (0, 1)
@@ -319,19 +314,12 @@ class Collector:
         obs[-1] = torch.from_numpy(self.next_obs).flatten(1)
         return obs, actions, rewards, terminated, done, prev_done
 
-    def averages(self, keys, groups):
-        """Means over each rank's last 100 episodes of "return" and `keys`; NaN where unknown.
-
-        And of the first key for each of `groups`, the values of info["task"]: "key/group".
-        """
-        known = {name: [e[name] for e in self.episodes if name in e] for name in ("return", *keys)}
-        for group in groups if keys else ():
-            known[f"{keys[0]}/{group}"] = [e[keys[0]] for e in self.episodes
-                                           if e.get("task") == group and keys[0] in e]
-        sums = [[float(sum(values)), len(values)] for values in known.values()]
-        sums = sum_over_ranks(torch.tensor(sums, dtype=torch.float64)).tolist()
-        return {name: total / n if n else math.nan
-                for name, (total, n) in zip(known, sums, strict=True)}
+    def averages(self, keys):
+        """Means of "return" and `keys` over each rank's last 100 episodes; NaN where unknown."""
+        known = [[e[key] for e in self.episodes if key in e] for key in ("return", *keys)]
+        sums = torch.tensor([[float(sum(values)), len(values)] for values in known])
+        totals, counts = sum_over_ranks(sums.double()).T
+        return dict(zip(("return", *keys), (totals / counts).tolist(), strict=True))
 
 
 # ---------------------------------------------------------------- learning
@@ -374,8 +362,6 @@ def update(model, optimiser, rollout, config, generator, target_kl, mirror=None)
         advantages, returns = advantages.repeat(2), returns.repeat(2)
     with torch.no_grad():
         old_log_prob = model.log_prob(obs, actions)
-    if len(obs) < config.num_minibatches:
-        raise ValueError(f"{len(obs)} rows are too few for {config.num_minibatches} minibatches")
 
     for _epoch in range(config.update_epochs):
         stats = torch.zeros(3)  # value loss, approx_kl, clipfrac
@@ -397,6 +383,7 @@ def update(model, optimiser, rollout, config, generator, target_kl, mirror=None)
         actor["lr"] = min(actor["lr"], max(actor["lr"] / 1.5, 1e-5))
     elif approx_kl < target_kl / 2:
         actor["lr"] = max(actor["lr"], min(actor["lr"] * 1.5, 1e-3))
+    model.normaliser.update(obs)  # only now: the old and the new policy must see the same scale
     # The critic's errors are the advantages, since returns = advantages + values.
     return {"approx_kl": approx_kl, "clipfrac": clipfrac, "value_loss": value_loss,
             "explained_variance": 1 - error / variance if variance > 0 else math.nan,
@@ -415,25 +402,72 @@ def descend(model, optimiser, loss, max_grad_norm):
     optimiser.step()
 
 
+def make_model(config, collector, checkpoint=None):
+    """The ActorCritic and its optimiser, new or as they were; equal on every rank.
+
+    Raises ValueError if the checkpoint's network is another one.
+    """
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(config.seed)
+        model = ActorCritic(collector.obs_dim, collector.act_dim, config.n_scan, config.hidden,
+                            config.init_std)
+    optimiser = torch.optim.Adam(
+        [{"params": list(model.actor.parameters()), "lr": config.learning_rate},
+         {"params": list(model.critic.parameters()), "lr": config.critic_learning_rate}],
+        fused=True)
+    if checkpoint:
+        if checkpoint["kwargs"] != model.kwargs:
+            raise ValueError(f"the checkpoint's network is {checkpoint['kwargs']}, but what is "
+                             f"asked for is {model.kwargs}")
+        model.load_state_dict(checkpoint["model"])
+        optimiser.load_state_dict(checkpoint["optimiser"])
+    return model, optimiser
+
+
+def iterate(model, optimiser, collector, config, progress, mirror):
+    """One iteration of PPO: a rollout and an update. progress: share of the training that is done.
+
+    Returns a dict of numbers, columns of progress.csv, and how many steps were taken. Raises
+    FloatingPointError if the parameters stop being numbers.
+    """
+    noise, target_kl = (first + progress * (last - first)
+                        for first, last in (config.noise, config.target_kl))
+    model.std.copy_(noise * torch.tensor(config.init_std))
+    start = time.perf_counter()
+    rollout = collector.collect(model, config.num_steps)
+    collected = time.perf_counter()
+    stats = update(model, optimiser, rollout, config, collector.generator, target_kl, mirror)
+    if not all(tensor.isfinite().all() for tensor in model.state_dict().values()):
+        raise FloatingPointError("an update made parameters infinite or NaN: are all rewards and "
+                                 "observations of the env numbers?")
+    seconds = {"collect_s": collected - start, "learn_s": time.perf_counter() - collected}
+    return seconds | stats, int((~rollout[-1]).sum())
+
+
 # ---------------------------------------------------------------- the files of a run
 
 
 def write_whole(path, content):
-    """torch.save, but `path` is whole or as it was, even if the power fails or the disk is full."""
-    buffer = io.BytesIO()  # torch's own words about a full disk are no OSError
-    torch.save(content, buffer)
+    """Writes bytes; `path` is whole or as it was, even if the power fails or the disk is full."""
     with open(f"{path}.tmp", "wb") as file:
-        file.write(buffer.getbuffer())
+        file.write(content)
         file.flush()
         os.fsync(file.fileno())
     os.replace(f"{path}.tmp", path)
+
+
+def save(path, **content):
+    """Writes a checkpoint or a policy: tensors and plain values."""
+    buffer = io.BytesIO()  # torch's own words about a full disk are no OSError
+    torch.save({"format": FORMAT, **content}, buffer)
+    write_whole(path, buffer.getvalue())
 
 
 def save_policy(path, model, meta):
     """Writes a policy to share: in half precision, without critic. `meta`: dict of plain values."""
     state = {name: tensor.half() if tensor.dtype == torch.float32 else tensor
              for name, tensor in model.state_dict().items() if not name.startswith("critic.")}
-    write_whole(path, {"format": FORMAT, "kwargs": model.kwargs, "model": state, "meta": meta})
+    save(path, kwargs=model.kwargs, model=state, meta=meta)
 
 
 def load_checkpoint(path):
@@ -465,85 +499,54 @@ def load_policy(path):
 
 
 class RunFolder:
-    """The folder of a run: config.json, progress.csv, curve.png, checkpoint.pt. Rank 0 opens it.
+    """The folder of a run: config.json, progress.csv, checkpoint.pt. Rank 0 alone has one.
 
-    `checkpoint` is what to go on from, or None. Raises FileExistsError rather than write over a
-    run, BlockingIOError if another process writes there, ValueError if a run is resumed with
-    another `meta`, and what load_checkpoint raises.
+    `checkpoint` is what to go on from, or None; its "history" holds the rows of progress.csv.
+    Raises FileExistsError rather than write over a run, BlockingIOError if another process writes
+    there, ValueError if a run is resumed with another `meta`, and what load_checkpoint raises.
     """
 
-    def __init__(self, path, meta, resume):
-        self.path, self.meta, self.checkpoint = Path(path), json.loads(json.dumps(meta)), None
+    def __init__(self, path, config, meta, resume):
+        self.path, self.checkpoint = Path(path), None
+        self.note = json.dumps({"ppo": asdict(config), "meta": meta}, indent=2)
+        self.meta = json.loads(self.note)["meta"]
         if resume:
             self.checkpoint = load_checkpoint(self.path / "checkpoint.pt")
-            if self.checkpoint.get("meta") != self.meta or "optimiser" not in self.checkpoint:
-                raise ValueError(f"{path} holds another run: {self.checkpoint.get('meta')}")
+            if self.checkpoint["meta"] != self.meta or "optimiser" not in self.checkpoint:
+                raise ValueError(f"{path} holds another run: {self.checkpoint['meta']}")
         elif (self.path / "checkpoint.pt").exists():
             raise FileExistsError(f"{path} already holds a run: resume it, or name another folder")
         self.path.mkdir(parents=True, exist_ok=True)
         self.lock = open(self.path / "lock", "w")
         try:
             fcntl.flock(self.lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            self._drop_rows_after(self.checkpoint["counters"][0] if resume else 0)
         except BlockingIOError:
             self.lock.close()
             raise BlockingIOError(f"another process is training in {path}") from None
-        except BaseException:
-            self.lock.close()
-            raise
 
-    def note(self, config):
-        """Writes config.json."""
-        text = json.dumps({"ppo": asdict(config), "meta": self.meta}, indent=2)
-        (self.path / "config.json").write_text(text + "\n")
+    def log(self, history):
+        """Writes progress.csv: a row, a dict of numbers, for each update."""
+        rows = [history[0], *(map("{:.10g}".format, row.values()) for row in history)]
+        write_whole(self.path / "progress.csv", "\n".join(map(",".join, rows)).encode() + b"\n")
 
-    def _drop_rows_after(self, last):
-        """From progress.csv: the updates after the checkpoint will be made again."""
-        if (progress := self.path / "progress.csv").exists():
-            header, *rows = progress.read_text(errors="replace").splitlines(keepends=True) or [""]
-            rows = [row for row in rows if row.endswith("\n") and row.split(",")[0].isdigit()]
-            rows = [row for row in rows if int(row.split(",")[0]) <= last]
-            (self.path / "progress.tmp").write_text("".join([header, *rows] if rows else []))
-            os.replace(self.path / "progress.tmp", progress)
-
-    def log(self, row):
-        """Appends a row, a dict of numbers, to progress.csv."""
-        with open(self.path / "progress.csv", "a") as file:
-            if file.tell() == 0:
-                file.write(",".join(row) + "\n")
-            file.write(",".join(f"{number:.10g}" for number in row.values()) + "\n")
-
-    def save(self, model, optimiser, counters, names):
-        """Writes checkpoint.pt, and curve.png of columns of progress.csv."""
-        write_whole(self.path / "checkpoint.pt", {
-            "format": FORMAT, "kwargs": model.kwargs, "model": model.state_dict(),
-            "optimiser": optimiser.state_dict(), "counters": counters, "meta": self.meta})
-        with contextlib.suppress(ImportError):  # no curve where matplotlib is not installed
-            from matplotlib.figure import Figure  # not pyplot: a notebook keeps its backend
-
-            with open(self.path / "progress.csv", newline="") as file:
-                rows = list(csv.DictReader(file))
-            figure = Figure(figsize=(4 * len(names), 3), layout="constrained")
-            axes = figure.subplots(1, len(names), squeeze=False)[0]
-            for axis, name in zip(axes, names, strict=True):
-                axis.plot(*([float(row[key]) for row in rows] for key in ("minutes", name)))
-                axis.set(xlabel="minutes", ylabel=name)
-            figure.savefig(self.path / "curve.png", dpi=100)
+    def save(self, model, optimiser, history):
+        """Writes checkpoint.pt and config.json."""
+        save(self.path / "checkpoint.pt", kwargs=model.kwargs, model=model.state_dict(),
+             optimiser=optimiser.state_dict(), history=history, meta=self.meta)
+        write_whole(self.path / "config.json", self.note.encode() + b"\n")
 
 
-def open_run(run_dir, meta, resume):
+def open_run(run_dir, config, meta, resume):
     """(RunFolder or None, checkpoint or None): rank 0 opens the folder, all know what it held."""
-    if resume and run_dir is None:
-        raise ValueError("resume = True, but there is no run_dir to go on from")
     run, found = None, [None]
-    rank, world = join_ranks()
+    rank, _ = join_ranks()
     if run_dir is not None and rank == 0:
         try:
-            run = RunFolder(run_dir, meta, resume)
+            run = RunFolder(run_dir, config, meta, resume)
             found = [run.checkpoint]
         except (OSError, ValueError, TypeError) as error:
             found = [error]
-    if world > 1:  # only rank 0's machine has the folder
+    if dist.is_initialized():  # only rank 0's machine has the folder
         dist.broadcast_object_list(found)
     if isinstance(found[0], Exception):
         raise found[0] if rank == 0 else SystemExit(2)  # one message is enough
@@ -553,83 +556,34 @@ def open_run(run_dir, meta, resume):
 # ---------------------------------------------------------------- the loop
 
 
-class Interrupt:
-    """`with Interrupt() as interrupt`: Ctrl-C sets interrupt.came; a second one raises."""
+@contextlib.contextmanager
+def note_interrupt():
+    """A list that the first Ctrl-C makes true; a second Ctrl-C raises KeyboardInterrupt."""
+    def note(*_):
+        came.append(True)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
-    def __enter__(self):
-        self.came, self.previous = False, signal.signal(signal.SIGINT, self._note)
-        return self
-
-    def _note(self, *_):
-        if self.came:
-            raise KeyboardInterrupt
-        self.came = True
-
-    def __exit__(self, *_):
-        signal.signal(signal.SIGINT, self.previous)
-
-
-def make_model(config, collector, checkpoint):
-    """The ActorCritic and its optimiser, new or as they were; equal on every rank.
-
-    Raises ValueError if the checkpoint's network is another one.
-    """
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(config.seed)
-        model = ActorCritic(collector.obs_dim, collector.act_dim, config.n_scan, config.hidden,
-                            config.init_std)
-    optimiser = torch.optim.Adam(
-        [{"params": list(model.actor.parameters()), "lr": config.learning_rate},
-         {"params": list(model.critic.parameters()), "lr": config.critic_learning_rate}],
-        fused=True)
-    if checkpoint:
-        if checkpoint["kwargs"] != model.kwargs:
-            raise ValueError(f"the checkpoint's network is {checkpoint['kwargs']}, but what is "
-                             f"asked for is {model.kwargs}")
-        model.load_state_dict(checkpoint["model"])
-        optimiser.load_state_dict(checkpoint["optimiser"])
-        optimiser.param_groups[1]["lr"] = config.critic_learning_rate
-    return model, optimiser
-
-
-def iterate(model, optimiser, collector, config, progress, mirror):
-    """One iteration of PPO: collect, learn, and only then take what was seen into the normaliser.
-
-    While learning, the old and the new policy must see the same scale. progress: share of the
-    training that is done. Returns a dict of numbers, columns of progress.csv, and how many steps.
-    Raises FloatingPointError if the parameters stop being numbers.
-    """
-    noise, target_kl = (first + progress * (last - first)
-                        for first, last in (config.noise, config.target_kl))
-    model.std.copy_(noise * torch.tensor(config.init_std))
-    start = time.perf_counter()
-    rollout = collector.collect(model, config.num_steps)
-    collected = time.perf_counter()
-    stats = update(model, optimiser, rollout, config, collector.generator, target_kl, mirror)
-    obs, prev_done = rollout[0], rollout[-1]
-    seen = obs[:-1][~prev_done]
-    model.normaliser.update(with_images(seen, *mirror[0]) if mirror else seen)
-    if not all(tensor.isfinite().all() for tensor in model.state_dict().values()):
-        raise FloatingPointError("an update made parameters infinite or NaN: are all rewards and "
-                                 "observations of the env numbers?")
-    learned = time.perf_counter()
-    return {"collect_s": collected - start, "learn_s": learned - collected, **stats}, len(seen)
+    came, before = [], signal.signal(signal.SIGINT, note)
+    try:
+        yield came
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def learn(make_env, config, *, run_dir=None, resume=False, mirror=None, meta=None,
-          episode_keys=(), groups=(), on_update=None, leg=lambda steps: 0):
+          episode_keys=(), on_update=None, stage_end=lambda steps: math.inf):
     """Trains on `make_env` until config.total_timesteps. Returns the ActorCritic and its steps.
 
     Args:
-        make_env: function of the environment's number over all ranks, and of the leg, to a
+        make_env: function of the environment's number over all ranks, and of the steps so far, to a
             Gymnasium env with Box spaces. What the env gets is clipped to its action space, and the
             policy's mean lies in (-1, 1): other bounds need gymnasium.wrappers.RescaleAction.
         run_dir: folder of the run's files; None: no files. resume: go on from its checkpoint.
-        mirror: see `update`. episode_keys, groups: see Collector.averages.
+        mirror: see `update`. episode_keys: see Collector.averages.
         meta: plain dict kept in the checkpoint; a resumed run's must be equal.
         on_update: called on rank 0 after every update as on_update(model, row of progress.csv).
-        leg: function of the steps so far. When its value changes the leg is over: `learn` returns,
-            and is to be called again, to resume, with new envs.
+        stage_end: function of the steps so far to those at which `learn` returns before the end: it
+            is to be called again, to resume, with new envs.
 
     At each checkpoint all envs are reset, and random numbers start afresh from (seed, update,
     rank). So going on from a checkpoint gives the same parameters, to the last bit, as never having
@@ -639,39 +593,40 @@ def learn(make_env, config, *, run_dir=None, resume=False, mirror=None, meta=Non
     """
     torch.set_num_threads(1)  # more threads only cost time on nets this small
     rank, world = join_ranks()
-    run, checkpoint = open_run(run_dir, meta, resume)
-    n_updates, steps, minutes = checkpoint["counters"] if checkpoint else (0, 0, 0.0)
-    this_leg, fresh, stopped, total = leg(steps), True, False, config.total_timesteps
-    shown = ["return", *episode_keys[:1]]
+    run, checkpoint = open_run(run_dir, config, meta, resume)
+    history = checkpoint["history"] if checkpoint else []
+    n_updates, steps, minutes = list(history[-1].values())[:3] if history else (0, 0, 0.0)
+    total, shown = config.total_timesteps, ["return", *episode_keys[:1]]
+    end, fresh, stopped = min(stage_end(steps), total), True, False
     with contextlib.ExitStack() as stack:
         stack.enter_context(run.lock if run else contextlib.nullcontext())
-        collector = Collector(partial(make_env, leg=this_leg), config.num_envs, rank, world)
+        collector = Collector(partial(make_env, steps=steps), config.num_envs, rank, world)
         stack.enter_context(contextlib.closing(collector.envs))
         model, optimiser = make_model(config, collector, checkpoint)
-        if run:
-            run.note(config)
-        interrupt = stack.enter_context(Interrupt())
+        interrupted = stack.enter_context(note_interrupt())
         bar = stack.enter_context(tqdm(total=total, initial=steps, unit="step", disable=rank > 0))
-        while steps < total and leg(steps) == this_leg and not stopped:
+        while steps < end and not stopped:
             if fresh:
                 collector.reset(config.seed, n_updates, rank)
             stats, seen = iterate(model, optimiser, collector, config, steps / total, mirror)
-            sums = sum_over_ranks(torch.tensor([seen, interrupt.came], dtype=torch.float64))
-            new_steps, stopped = sums.long().tolist()  # one Ctrl-C stops all ranks
-            n_updates, steps = n_updates + 1, steps + new_steps
+            sums = sum_over_ranks(torch.tensor([seen, bool(interrupted)], dtype=torch.float64))
+            seen, stopped = sums.long().tolist()  # one Ctrl-C stops all ranks
+            n_updates, steps = n_updates + 1, steps + seen
             minutes += (stats["collect_s"] + stats["learn_s"]) / 60
             row = {"update": n_updates, "steps": steps, "minutes": minutes,
-                   **collector.averages(episode_keys, groups), **stats}
+                   **collector.averages(episode_keys), **stats}
+            history.append(row)
+            # The first update has a checkpoint, too: from then on nothing is lost.
             fresh = (n_updates == 1 or n_updates % config.checkpoint_every == 0 or stopped
-                     or steps >= total or leg(steps) != this_leg)
-            bar.update(new_steps)
+                     or steps >= end)
+            bar.update(seen)
             bar.set_postfix({name: f"{row[name]:.3g}" for name in shown})
             if run:
-                run.log(row)
-                if fresh:
-                    run.save(model, optimiser, (n_updates, steps, minutes), shown)
+                run.log(history)
+            if run and fresh:
+                run.save(model, optimiser, history)
             if on_update and rank == 0:
                 on_update(model, row)
-    if stopped or interrupt.came:
+    if stopped or interrupted:
         raise KeyboardInterrupt
     return model, steps

@@ -116,29 +116,39 @@ def _quads(*corners):
     return vertices, np.concatenate([first + [0, 1, 2], first + [0, 2, 3]], 1).reshape(-1, 3)
 
 
+def _runs(*layers):
+    """Where rows of all layers (m, n) stay as they are: row, first, last (exclusive), their values.
+
+    Of two layers only those runs count in which they differ.
+    """
+    change = np.any([np.diff(layer, axis=1, prepend=np.nan) != 0 for layer in layers], 0)
+    row, first = np.nonzero(change)
+    last = np.where(np.roll(first, -1) > 0, np.roll(first, -1), change.shape[1])
+    values = [layer[row, first] for layer in layers]
+    kept = values[0] != values[-1] if len(layers) > 1 else np.full(len(row), True)
+    return row[kept], first[kept], last[kept], [value[kept] for value in values]
+
+
 def fuse_pillars(heights, cell):
     """Mesh of m x n pillars without the faces that cannot be seen (section 2.3).
 
-    One mesh is simulated and scanned many times faster than 2,400 boxes. Tops of equal neighbours
-    along y grow into one, and walls stand only between unequal ones. The outer border is open.
+    One mesh is simulated and scanned many times faster than 2,400 boxes. Equal neighbours
+    along y share one top. Walls stand only between unequal ones, and grow into one where they are
+    alike. The outer border is open.
 
     heights: (m, n) m. cell: m, the pillars' cross-section.
     Returns vertices (V, 3) m and triangles (F, 3), counter-clockwise from outside.
     """
-    h, middle = heights, heights.shape[1] / 2
-    i, first = np.nonzero(np.diff(h, axis=1, prepend=np.nan) != 0)  # where a new top begins
-    last = np.where(np.roll(first, -1) > 0, np.roll(first, -1), h.shape[1])
-    x0, x1, z = i * cell, (i + 1) * cell, h[i, first]
-    y0, y1 = (first - middle) * cell, (last - middle) * cell
+    middle = heights.shape[1] / 2
+    i, first, last, (z,) = _runs(heights)
+    x0, x1, y0, y1 = i * cell, (i + 1) * cell, (first - middle) * cell, (last - middle) * cell
     tops = _quads((x0, y0, z), (x1, y0, z), (x1, y1, z), (x0, y1, z))
     # The corners turn round with the sign of z0 - z1: each wall faces its lower side by itself.
-    i, j = np.nonzero(h[:-1] != h[1:])
-    z0, z1, x = h[i, j], h[i + 1, j], (i + 1) * cell
-    y0, y1 = (j - middle) * cell, (j + 1 - middle) * cell
+    i, first, last, (z0, z1) = _runs(heights[:-1], heights[1:])
+    x, y0, y1 = (i + 1) * cell, (first - middle) * cell, (last - middle) * cell
     across = _quads((x, y0, z1), (x, y1, z1), (x, y1, z0), (x, y0, z0))
-    i, j = np.nonzero(h[:, :-1] != h[:, 1:])
-    z0, z1, y = h[i, j], h[i, j + 1], (j + 1 - middle) * cell
-    x0, x1 = i * cell, (i + 1) * cell
+    j, first, last, (z0, z1) = _runs(heights[:, :-1].T, heights[:, 1:].T)
+    x0, x1, y = first * cell, last * cell, (j + 1 - middle) * cell
     along = _quads((x0, y, z0), (x1, y, z0), (x1, y, z1), (x0, y, z1))
     return join([tops, across, along])
 
@@ -357,10 +367,30 @@ def stairs(rng, difficulty):
 
 def slopes(rng, difficulty):
     """A ridge or a valley across the way, up and down at up to 35 degrees, to 2.1 m high."""
+    _, _, u = _grid(slopes.cell)
     up, down = rng.uniform(1.5, 3.0, 2)
     top = np.tan(np.radians(35 * difficulty * rng.uniform(0.7, 1))) * min(up, down)
     a, b = np.sort(rng.uniform(up, SPAN - down, 2))
-    return rng.choice([-1, 1]) * np.interp(U, [a - up, a, b, b + down], [0, top, top, 0])
+    return rng.choice([-1, 1]) * np.interp(u, [a - up, a, b, b + down], [0, top, top, 0])
+
+
+slopes.cell = L / 8  # m: steps so low that feet slip as on smooth ground
+
+
+def ridges(rng, difficulty):
+    """Up to 10 ridges, 1-4 m wide and to 1 m high, with flanks of 20-50 degrees at most."""
+    x, y, u = _grid(ridges.cell)
+    h = np.zeros(x.shape)
+    for _ in range(round(10 * difficulty)):
+        x0, y0, half = rng.uniform(2.5, 9.5), rng.uniform(-4, 4), rng.uniform(0.5, 2.0)
+        steep, top = np.tan(np.radians(rng.uniform(20, 50) * difficulty)), rng.uniform(0.3, 1.0)
+        ridge = np.where(np.abs(y - y0) <= half, top - steep * np.abs(x - x0), 0.0)
+        h = np.maximum(h, ridge)
+    return h
+
+
+ridges.cell = L / 8
+ridges.climb = 0.06  # m: the way leads round flanks steeper than 31 degrees
 
 
 def hills(rng, difficulty):
@@ -455,7 +485,7 @@ for _task in (obstacles, poles, corridors, walls, screens, traps):
 
 PILLAR_TASKS = {task.__name__: task for task in (
     flat, rugged, holes, obstacles, stairs, slopes, hills, pyramids, bars, pits, causeways,
-    corridors, walls, screens, traps, poles)}
+    corridors, walls, screens, traps, poles, ridges)}
 
 
 def make_terrain(task, rng, difficulty):
@@ -476,6 +506,7 @@ def make_terrain(task, rng, difficulty):
         raise ValueError(f"difficulty must be in [0, 1], got {difficulty}")
     generate = task if callable(task) else PILLAR_TASKS[task]
     name, cell = getattr(generate, "__name__", "terrain"), getattr(generate, "cell", L)
+    climb = getattr(generate, "climb", STEP)
     for _ in range(DRAWS):
         heights = np.array(generate(rng, difficulty), float)
         if heights.ndim != 2 or not heights.size or not np.isfinite(heights).all():
@@ -489,14 +520,14 @@ def make_terrain(task, rng, difficulty):
         length = len(heights) * cell
         # From either end, in turn with wherever else a robot can stand: in a corridor, say.
         zones = (1.0, PAD * L), (length - PAD * L, length - 1.0), (0.0, length)
-        routes = find_routes(Navigation(heights, cell, STEP), rng, ROUTES, (min(6, length / 2), 9),
+        routes = find_routes(Navigation(heights, cell, climb), rng, ROUTES, (min(6, length / 2), 9),
                              zones=zones, margin=1.0)
         if routes:
             # Some begin with their back to the goal: what lies behind it is worth a look, too.
             routes[0][2::3, 3] += rng.uniform(-np.pi, np.pi, len(routes[0][2::3]))
             mesh = fuse_pillars(heights, cell)
             check_size(name, *mesh)
-            return Terrain(name, *mesh, *routes, heights, cell)
+            return Terrain(name, *mesh, *routes, heights, cell, climb)
     raise ValueError(f"task {name!r} gave no walkable route in {DRAWS} draws of {heights.shape}")
 
 

@@ -38,7 +38,7 @@ def shrink(patch=setattr):
 def small(monkeypatch, tmp_path):
     """`main` trains as rank 0 of 1, in this process and on little, in a folder of its own."""
     shrink(monkeypatch.setattr)
-    for name, value in (("RANK", "0"), ("WORLD_SIZE", "1"), ("PPO_LEG", "0")):
+    for name, value in (("RANK", "0"), ("WORLD_SIZE", "1"), ("PPO_STAGE", "0")):
         monkeypatch.setenv(name, value)
     monkeypatch.chdir(tmp_path)
 
@@ -108,20 +108,19 @@ def test_ablations_give_policies_of_their_kind(small, tmp_path, flags, n_obs, n_
     assert act(np.zeros(n_obs)).shape == (n_act,)
     told = config(tmp_path / "run")
     assert (told["ppo"]["n_scan"], told["ppo"]["seed"]) == (n_scan, 3)
-    shares = [name for name in progress(tmp_path / "run")[0] if name.startswith("t_cr/")]
-    assert shares == [f"t_cr/{task}" for task in told["meta"]["tasks"]]
 
 
 def test_sequential_training_takes_each_task_in_a_new_process(small, monkeypatch, tmp_path):
-    legs, programs, make = [], [], loco_mtrl.training_env
+    stages, programs, make = [], [], loco_mtrl.training_env
 
     def execv(*command):
         programs.append(command)
         raise SystemExit
 
-    def training_env(index, leg, args):
-        legs.append(leg)
-        return make(index, leg, args)
+    def training_env(index, steps, args):
+        env = make(index, steps, args)
+        stages.append((steps, env.unwrapped.pool[0].name))
+        return env
 
     monkeypatch.setattr(os, "execv", execv)
     monkeypatch.setattr(loco_mtrl, "training_env", training_env)
@@ -129,8 +128,8 @@ def test_sequential_training_takes_each_task_in_a_new_process(small, monkeypatch
     with pytest.raises(SystemExit):
         loco_mtrl.main(arguments)
     assert programs == [(sys.executable, [sys.executable, *sys.orig_argv[1:]])]
-    assert loco_mtrl.main(arguments) == 0  # the new process: it knows its leg
-    assert legs == [(0, 0)] * 2 + [(0, 1)] * 2
+    assert loco_mtrl.main(arguments) == 0  # the new process: it knows its stage
+    assert stages == [(0, "flat")] * 2 + [(32, "stairs")] * 2
     assert [int(row["steps"]) for row in progress(tmp_path / "runs/main")] == [32, 64]
     assert loco_mtrl.load_actor(str(tmp_path / "runs/main/policy.pt"))[2] == "sequential"
 
@@ -172,8 +171,8 @@ def test_ctrl_c_says_how_to_go_on(small, monkeypatch, capsys, tmp_path, at, time
         return
     words = shlex.split(out.removeprefix("\nStopped. To go on: "))
     assert words == ["python", "loco_mtrl.py", *command, "--resume"]
-    saved = ppo.load_checkpoint(tmp_path / "a run" / "checkpoint.pt")["counters"]
-    assert saved[0] == len(progress(tmp_path / "a run")) == updates
+    saved = ppo.load_checkpoint(tmp_path / "a run" / "checkpoint.pt")["history"]
+    assert len(saved) == len(progress(tmp_path / "a run")) == updates
     assert loco_mtrl.main(words[2:]) == 0
     assert [int(row["steps"]) for row in progress(tmp_path / "a run")] == [32, 64, 96]
 
@@ -184,8 +183,8 @@ def test_ctrl_c_stops_all_ranks_after_the_running_update(tmp_path):
     assert code == 130 and "Traceback" not in error
     assert out == f"\nStopped. To go on: python loco_mtrl.py {command} --resume\n"
     rows, run = progress(tmp_path / "runs" / "main"), tmp_path / "runs" / "main"
-    saved = ppo.load_checkpoint(run / "checkpoint.pt")["counters"]
-    assert saved[:2] == (len(rows), int(rows[-1]["steps"]))
+    saved = ppo.load_checkpoint(run / "checkpoint.pt")["history"]
+    assert (len(saved), saved[-1]["steps"]) == (len(rows), int(rows[-1]["steps"]))
 
 
 @pytest.fixture

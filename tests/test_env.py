@@ -450,29 +450,32 @@ def test_mirror_is_what_a_mirrored_robot_would_observe(flat):
 
 def test_each_training_environment_has_one_task_and_layouts_of_its_own(monkeypatch):
     monkeypatch.setattr(loco_mtrl, "LAYOUTS", 2)
-    args = dict(tasks=["flat", "rugged", "stairs"], tg=True, lidar=False, sequential=False, seed=0)
+    args = dict(tasks=["flat", "rugged", "stairs"], tg=True, lidar=False, sequential=False, seed=0,
+                steps=900_000)
 
-    def pool(index, leg, **changes):
-        with closing(training_env(index, leg, SimpleNamespace(**args | changes))) as env:
+    def pool(index, steps=0, **changes):
+        with closing(training_env(index, steps, SimpleNamespace(**args | changes))) as env:
             assert env.observation_space.shape == (42,)
             return [(terrain.name, terrain.vertices.tobytes()) for terrain in env.unwrapped.pool]
 
-    assert [{name for name, _ in pool(index, (0, 0))} for index in range(4)] == [
+    assert [{name for name, _ in pool(index)} for index in range(4)] == [
         {"flat"}, {"rugged"}, {"stairs"}, {"flat"}]
-    first = pool(1, (0, 0))
-    assert len(set(first)) == 2 and pool(1, (0, 0)) == first
-    others = pool(4, (0, 0)) + pool(1, (1, 0)) + pool(1, (0, 0), seed=1)  # index, leg, seed
+    first = pool(1)
+    assert len(set(first)) == 2 and pool(1) == first
+    others = pool(4) + pool(1, 400_000) + pool(1, seed=1)  # index, stage, seed
     assert {name for name, _ in others} == {"rugged"} and len(set(first + others)) == 8
-    assert {name for name, _ in pool(0, (0, 2), sequential=True)} == {"stairs"}
+    assert {name for name, _ in pool(0, 600_000, sequential=True)} == {"stairs"}
 
 
-def test_a_new_leg_begins_every_400000_steps_and_with_each_task_that_follows_another():
+def test_a_new_stage_begins_every_400000_steps_and_with_each_task_that_follows_another():
     args = SimpleNamespace(tasks=["flat", "rugged", "stairs"], steps=900_000, sequential=False)
-    steps = 0, 299_999, 300_000, 400_000, 800_000, 900_000
-    assert [loco_mtrl.leg_of(n, args) for n in steps] == [(n, 0) for n in (0, 0, 0, 1, 2, 2)]
+    stages = {0: (0, 0, 400_000), 399_999: (0, 0, 400_000), 400_000: (1, 0, 800_000),
+              800_001: (2, 0, 900_000), 900_500: (2, 0, 900_000)}
+    assert {steps: loco_mtrl.stage(steps, args) for steps in stages} == stages
     args.sequential = True
-    assert [loco_mtrl.leg_of(n, args) for n in steps] == [
-        (0, 0), (0, 0), (0, 1), (1, 1), (2, 2), (2, 2)]
+    stages = {0: (0, 0, 300_000), 300_000: (0, 1, 400_000), 400_000: (1, 1, 600_000),
+              600_000: (1, 2, 800_000), 800_000: (2, 2, 900_000), 900_500: (2, 2, 900_000)}
+    assert {steps: loco_mtrl.stage(steps, args) for steps in stages} == stages
 
 
 def test_a_finished_terrain_is_walked_as_it_is():

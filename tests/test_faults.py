@@ -49,7 +49,7 @@ def train(folder, stop=None, resume=False, total=3, env=Probe, changes=None, **o
             raise Stop
 
     options = {"on_update": on_update, "meta": {"a": 1}} | options
-    make = lambda index, leg: env(lambda obs, action, t: obs[0] * action, length=5)  # noqa: E731
+    make = lambda index, steps: env(lambda obs, action, t: obs[0] * action, length=5)  # noqa: E731
     try:
         return states(ppo.learn(make, config, run_dir=folder, resume=resume, **options)[0])
     except Stop:
@@ -89,8 +89,7 @@ def die(*_, **__):
 
 
 WRITERS = [function.__code__ for function in (
-    ppo.RunFolder.__init__, ppo.RunFolder._drop_rows_after, ppo.RunFolder.log, ppo.RunFolder.save,
-    ppo.write_whole)]
+    ppo.RunFolder.__init__, ppo.RunFolder.log, ppo.RunFolder.save, ppo.save, ppo.write_whole)]
 
 
 @pytest.mark.parametrize("stop", [None, 1], ids=["fresh", "resumed"])
@@ -167,40 +166,32 @@ def test_a_full_disk_leaves_the_last_checkpoint(room, tmp_path, unbroken):
     assert same_bits(train(tmp_path, resume=True), unbroken)
 
 
-@pytest.mark.parametrize(("damage", "left"), [
-    (lambda text: None, [2, 3]), (lambda text: "", [2, 3]), (lambda text: text[:7], [2, 3]),
-    (lambda text: text[:-9], [2, 3]), (lambda text: text.splitlines()[0], [2, 3]),
-    (lambda text: text + text.splitlines()[1][:20], [1, 2, 3]),
-    (lambda text: text + "2,999\n3,1", [1, 2, 3]),
-], ids=["none", "empty", "half a header", "half a row", "header", "one and a half", "later rows"])
-def test_a_damaged_table_stops_no_resume(damage, left, tmp_path, unbroken):
+@pytest.mark.parametrize("damage", [None, "", "upd", "update,steps\n1,2\n9,99\n"])
+def test_a_damaged_table_is_written_anew(damage, tmp_path, unbroken):
     train(tmp_path, stop=1)
-    text = damage((tmp_path / "progress.csv").read_text())
     (tmp_path / "progress.csv").unlink()
-    if text is not None:
-        (tmp_path / "progress.csv").write_text(text)
+    if damage is not None:
+        (tmp_path / "progress.csv").write_text(damage)
     assert same_bits(train(tmp_path, resume=True), unbroken)
-    rows = table(tmp_path)
-    assert [int(row["update"]) for row in rows] == left
-    assert [int(row["steps"]) for row in rows] == [UPDATE * update for update in left]
+    assert [int(row["steps"]) for row in table(tmp_path)] == [UPDATE, 2 * UPDATE, 3 * UPDATE]
 
 
 # ---------------------------------------------------------------- stopped and resumed
 
 
-def test_legs_in_turn_make_the_run_in_one_piece(tmp_path, unbroken):
-    seen, model, leg = [], None, lambda steps: ("leg", steps // UPDATE)
-    config = ppo.PPOConfig(total_timesteps=3 * UPDATE, **TINY)
+def test_stages_in_turn_make_the_run_in_one_piece(tmp_path, unbroken):
+    seen, config = [], ppo.PPOConfig(total_timesteps=3 * UPDATE, **TINY)
 
-    def make(index, leg):
-        seen.append((index, leg))
+    def make(index, steps):
+        seen.append((index, steps))
         return Probe(lambda obs, action, t: obs[0] * action, length=5)
 
     for number in range(3):
-        model, steps = ppo.learn(make, config, run_dir=tmp_path, resume=number > 0, leg=leg)
+        model, steps = ppo.learn(make, config, run_dir=tmp_path, resume=number > 0,
+                                 stage_end=lambda steps: steps + 1)
         assert steps == (number + 1) * UPDATE
     assert same_bits(states(model), unbroken)
-    assert seen == [(index, ("leg", number)) for number in range(3) for index in range(2)]
+    assert seen == [(index, number * UPDATE) for number in range(3) for index in range(2)]
 
 
 def test_a_run_is_not_opened_twice(tmp_path):
@@ -261,7 +252,7 @@ def test_ctrl_c_finishes_the_update_and_keeps_it(tmp_path, unbroken):
     with pytest.raises(KeyboardInterrupt):
         train(tmp_path, on_update=interrupt)
     assert signal.getsignal(signal.SIGINT) is before
-    assert ppo.load_checkpoint(tmp_path / "checkpoint.pt")["counters"][:2] == (2, 2 * UPDATE)
+    assert ppo.load_checkpoint(tmp_path / "checkpoint.pt")["history"][-1]["steps"] == 2 * UPDATE
     assert len(table(tmp_path)) == 2
     assert same_bits(train(tmp_path, resume=True), unbroken)
 
@@ -279,7 +270,7 @@ def test_a_second_ctrl_c_stops_at_once_and_the_last_checkpoint_is_whole(tmp_path
     with pytest.raises(KeyboardInterrupt):
         train(tmp_path, env=Impatient)
     assert len(steps) == 2 * UPDATE + 5
-    assert ppo.load_checkpoint(tmp_path / "checkpoint.pt")["counters"][0] == 2
+    assert ppo.load_checkpoint(tmp_path / "checkpoint.pt")["history"][-1]["update"] == 2
     assert same_bits(train(tmp_path, resume=True), unbroken)
 
 
@@ -343,7 +334,7 @@ class Tiny(loco_mtrl.PPOConfig):
     num_minibatches: int = 2
 
 sys.modules["matplotlib.figure"] = None
-loco_mtrl.PPOConfig, loco_mtrl.LAYOUTS, loco_mtrl.LEG = Tiny, 1, int(os.environ["LEG"])
+loco_mtrl.PPOConfig, loco_mtrl.LAYOUTS, loco_mtrl.STAGE = Tiny, 1, int(os.environ["STAGE"])
 os.write(1, f"rank {os.getpid()}\\n".encode())  # at once, lest the ranks' words mix
 sys.exit(loco_mtrl.main())
 """
@@ -351,18 +342,18 @@ sys.exit(loco_mtrl.main())
 
 @pytest.fixture
 def job(tmp_path, monkeypatch):
-    """Starts the command line for a tiny training of two ranks, with another length of a leg."""
-    def begin(leg, *arguments):
+    """Starts the command line for a tiny training of two ranks, with another length of a stage."""
+    def begin(stage, *arguments):
         command = ["train", "--tasks", "flat", "--no-lidar", "--ranks", "2", "--run-dir",
                    str(tmp_path / "run"), *map(str, arguments)]
-        return start(lambda: loco_mtrl.main(command), LEG=str(leg))
+        return start(lambda: loco_mtrl.main(command), STAGE=str(stage))
 
     (tmp_path / "job.py").write_text(JOB)
     monkeypatch.setattr(loco_mtrl, "__file__", str(tmp_path / "job.py"))
     return begin
 
 
-def test_after_each_leg_every_process_starts_itself_afresh(job, tmp_path):
+def test_after_each_stage_every_process_starts_itself_afresh(job, tmp_path):
     process = job(40, "--steps", 64)  # of 16 steps each: three updates, and one
     text = read(process)
     assert process[0].exitcode == 0 and "policy.pt" in text, text
@@ -382,7 +373,7 @@ def test_a_killed_rank_ends_the_training_with_one_message(job, tmp_path):
     assert "rank 1 was killed by signal 9. To go on" in text.splitlines()[-1]
     assert text.splitlines()[-1].endswith(f"--run-dir {tmp_path / 'run'} --resume")
     assert "Traceback" not in text
-    assert ppo.load_checkpoint(tmp_path / "run" / "checkpoint.pt")["counters"][0] >= 1
+    assert ppo.load_checkpoint(tmp_path / "run" / "checkpoint.pt")["history"][-1]["update"] >= 1
 
 
 def test_killed_ranks_are_all_named(tmp_path, monkeypatch, capsys):
@@ -443,9 +434,9 @@ def test_two_agents_train_what_one_does_that_crashes(ranks_of_torchrun):
 
 
 def walk(folder, monkeypatch, stop=None, resume=False):
-    """Six updates of two robots with LiDAR and symmetry, in two legs."""
+    """Six updates of two robots with LiDAR and symmetry, in two stages."""
     monkeypatch.setattr(loco_mtrl, "LAYOUTS", 1)
-    monkeypatch.setattr(loco_mtrl, "LEG", 128)
+    monkeypatch.setattr(loco_mtrl, "STAGE", 128)
     args = Namespace(tg=True, lidar=True, tasks=["stairs", "obstacles"], sequential=False, seed=0,
                      steps=192)
     config = ppo.PPOConfig(num_envs=2, num_steps=16, total_timesteps=192, checkpoint_every=2,
@@ -460,8 +451,8 @@ def walk(folder, monkeypatch, stop=None, resume=False):
     while steps < 192:
         model, steps = ppo.learn(
             partial(loco_mtrl.training_env, args=args), config, run_dir=folder, mirror=mirror,
-            resume=resume or steps > 0, episode_keys=("t_cr",), groups=args.tasks,
-            leg=partial(loco_mtrl.leg_of, args=args), on_update=on_update)
+            resume=resume or steps > 0, episode_keys=("t_cr",), on_update=on_update,
+            stage_end=lambda n: loco_mtrl.stage(n, args)[2])
     return states(model)
 
 
