@@ -369,12 +369,14 @@ def slopes(rng, difficulty):
     """A ridge or a valley across the way, up and down at up to 35 degrees, to 2.1 m high."""
     _, _, u = _grid(slopes.cell)
     up, down = rng.uniform(1.5, 3.0, 2)
-    top = np.tan(np.radians(35 * difficulty * rng.uniform(0.7, 1))) * min(up, down)
+    steep = np.radians(min(45 * difficulty, 35) * rng.uniform(0.75, 1))
+    top = np.tan(steep) * min(up, down)
     a, b = np.sort(rng.uniform(up, SPAN - down, 2))
     return rng.choice([-1, 1]) * np.interp(u, [a - up, a, b, b + down], [0, top, top, 0])
 
 
-slopes.cell = L / 8  # m: steps so low that feet slip as on smooth ground
+# m: steps so low that feet slip on 30 degrees, as on smooth slopes of 20, until they crouch.
+slopes.cell = L / 8
 
 
 def ridges(rng, difficulty):
@@ -394,11 +396,11 @@ ridges.climb = 0.06  # m: the way leads round flanks steeper than 31 degrees
 
 
 def hills(rng, difficulty):
-    """Twelve round hills and hollows, 1.5-3.5 m across, with flanks of up to 32 degrees each."""
+    """Twelve round hills and hollows, 1.5-3.5 m across, with flanks of up to 38 degrees each."""
     x, y, u = _grid(hills.cell)
     h = np.zeros(x.shape)
     for _ in range(12):
-        radius, steep = rng.uniform(0.75, 1.75), np.tan(np.radians(32 * difficulty))
+        radius, steep = rng.uniform(0.75, 1.75), np.tan(np.radians(38 * difficulty))
         far = np.hypot(x - rng.uniform(2, 10), y - rng.uniform(-4, 4)) / radius
         bump = 0.64 * radius * np.cos(np.pi / 2 * far.clip(0, 1)) ** 2  # steepest: 1
         h += rng.choice([-1, 1]) * rng.uniform(0.5, 1) * steep * bump
