@@ -605,6 +605,8 @@ def train(args):
         if first:
             print(f"\nStopped. To go on: {again(args)}" if checkpoint.exists() else "\nStopped.")
         return 130
+    if first and args.sequential:  # what each task leaves of the ones before it
+        save_policy(run_dir / f"policy-{steps}.pt", model, meta)
     if steps < args.steps:  # Bullet gives no memory back but to a new process
         if torch.distributed.is_initialized():
             torch.distributed.destroy_process_group()

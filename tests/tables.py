@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from loco_mtrl import PAPER, WORLDS, evaluate
+from loco_mtrl import PAPER, PILLAR_TASKS, WORLDS, evaluate
 from ppo import PPOConfig, load_checkpoint
 
 ROOT = Path(__file__).parent.parent
@@ -35,6 +35,7 @@ TABLES = {"Table 1: one terrain against many": ["flat", "rugged", "holes", "obst
                                                 "ours"],
           "Table 2: what each part is worth": ["reactive", "no vision", "sequential", "ours"]}
 EPISODES = 20
+FIRST = list(PILLAR_TASKS)[:3]  # what sequential training may forget
 COLUMNS = ["row", "seed", "world", "episodes", "t_cr", "std", "success", "fall", "steps", "minutes",
            "commit"]
 
@@ -69,21 +70,22 @@ def train(row, seed, folder, steps):
     return run / "policy.pt"
 
 
-def score(row, seed, policy, episodes):
-    """A policy's rows of results.csv, one a world."""
-    last = load_checkpoint(policy.parent / "checkpoint.pt")["history"][-1]
+def score(row, seed, policy, places, episodes):
+    """A policy's rows of results.csv, one a place."""
+    history = load_checkpoint(policy.parent / "checkpoint.pt")["history"]
+    steps = int(policy.stem.partition("-")[2] or history[-1]["steps"])  # policy-STEPS.pt, a stage's
+    minutes = next(update["minutes"] for update in history if update["steps"] == steps)
     commit = subprocess.run(["git", "describe", "--always", "--dirty"], cwd=ROOT, text=True,
                             capture_output=True).stdout.strip()
-    scores = evaluate([str(policy)], list(WORLDS), episodes, os.cpu_count())
+    scores = evaluate([str(policy)], places, episodes, os.cpu_count())
     rows = []
-    for world in WORLDS:
-        runs = scores[str(policy), world]
+    for place in places:
+        runs = scores[str(policy), place]
         means = {key: f"{np.mean([run[key] for run in runs]):.4f}"
                  for key in ("t_cr", "success", "fall")}
         std = f"{np.std([run['t_cr'] for run in runs]):.4f}"
-        rows.append({"row": row, "seed": seed, "world": world, "episodes": episodes, **means,
-                     "std": std, "steps": last["steps"], "minutes": f"{last['minutes']:.1f}",
-                     "commit": commit})
+        rows.append({"row": row, "seed": seed, "world": place, "episodes": episodes, **means,
+                     "std": std, "steps": steps, "minutes": f"{minutes:.1f}", "commit": commit})
     return rows
 
 
@@ -91,8 +93,9 @@ def means(results):
     """{row: (seeds, 8) mean t_cr}, worlds in their order."""
     known = {}
     for result in results:
-        known.setdefault(result["row"], {}).setdefault(result["seed"], {})[result["world"]] = (
-            float(result["t_cr"]))
+        if result["world"] in WORLDS:
+            seeds = known.setdefault(result["row"], {})
+            seeds.setdefault(result["seed"], {})[result["world"]] = float(result["t_cr"])
     return {row: np.array([[worlds[world] for world in WORLDS] for worlds in seeds.values()])
             for row, seeds in known.items()}
 
@@ -118,6 +121,20 @@ def tables(results):
             lines.append(f"| *paper* | | {' | '.join(cells)} | {paper(row).mean():.3f} |")
         lines.append("")
     return "\n".join(lines)
+
+
+def forgetting(results):
+    """What sequential training leaves of its first tasks, as Markdown: t_cr after each stage."""
+    table = {}
+    for result in results:
+        if result["world"] in FIRST:
+            row = table.setdefault(round(int(result["steps"]), -4), {})  # alike for all seeds
+            row.setdefault(result["world"], []).append(float(result["t_cr"]))
+    lines = [f"| steps | {' | '.join(FIRST)} |", "|---" * (len(FIRST) + 1) + "|"]
+    for steps in sorted(table):
+        cells = [f"{np.mean(table[steps][task]):.2f}" for task in FIRST]
+        lines.append(f"| {steps} | {' | '.join(cells)} |")
+    return "\n".join(["**Forgetting**: t_cr on the first tasks, in sequence", "", *lines, ""])
 
 
 def draw(results, path):
@@ -151,9 +168,12 @@ def main(argv=None):
     for row, seed in jobs:
         if (row, str(seed)) not in {(r["row"], r["seed"]) for r in read(out / "results.csv")}:
             policy = train(row, seed, runs, steps)
-            append(out / "results.csv", score(row, seed, policy, episodes))
+            rows = score(row, seed, policy, list(WORLDS), episodes)
+            for stage in policy.parent.glob("policy-*.pt"):  # of sequential training, after a task
+                rows += score(row, seed, stage, FIRST, episodes)
+            append(out / "results.csv", rows)
     results = read(out / "results.csv")
-    print(tables(results))
+    print(tables(results), forgetting(results), sep="\n")
     draw(results, out / "tables.png")
 
 

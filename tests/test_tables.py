@@ -29,6 +29,13 @@ def test_tables_by_hand():
     assert sum("*paper*" in line for line in lines) == 10 and "reactive" not in str(found)
 
 
+def test_forgetting_by_hand():
+    told = [{"world": task, "steps": steps, "t_cr": t_cr} for steps, t_cr in
+            (("9990", "0.5"), ("10080", "0.7"), ("20000", "0.1")) for task in ("flat", "rugged", "holes")]
+    lines = tables.forgetting(told).splitlines()
+    assert lines[-2:] == ["| 10000 | 0.60 | 0.60 | 0.60 |", "| 20000 | 0.10 | 0.10 | 0.10 |"]
+
+
 def test_readme_shows_the_tables_of_the_results():
     path = ROOT / "policies" / "results.csv"
     if not path.exists():
