@@ -30,8 +30,9 @@ def test_tables_by_hand():
 
 
 def test_forgetting_by_hand():
-    told = [{"world": task, "steps": steps, "t_cr": t_cr} for steps, t_cr in
-            (("9990", "0.5"), ("10080", "0.7"), ("20000", "0.1")) for task in ("flat", "rugged", "holes")]
+    scores = ("9990", "0.5"), ("10080", "0.7"), ("20000", "0.1")
+    told = [{"world": task, "steps": steps, "t_cr": t_cr}
+            for steps, t_cr in scores for task in ("flat", "rugged", "holes")]
     lines = tables.forgetting(told).splitlines()
     assert lines[-2:] == ["| 10000 | 0.60 | 0.60 | 0.60 |", "| 20000 | 0.10 | 0.10 | 0.10 |"]
 
