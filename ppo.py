@@ -44,7 +44,7 @@ class PPOConfig:
     total_timesteps: int = 600_000  # environment steps over all ranks, resets not counted
     num_envs: int = 34  # environments over all ranks
     num_steps: int = 128  # steps of each environment between two updates
-    gamma: float = 0.995  # discount per step
+    gamma: float = 0.998  # discount per step
     gae_lambda: float = 0.95  # 0: one-step TD, little variance; 1: Monte Carlo, no bias
     update_epochs: int = 3  # passes over each rollout
     num_minibatches: int = 8  # gradient steps per pass
