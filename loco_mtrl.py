@@ -48,15 +48,20 @@ from tg import LEGS, STANDING, TrajectoryGenerator
 @contextlib.contextmanager
 def quiet():
     """PyBullet prints banners from C; they have no place in progress bars and JSON."""
-    sys.stdout.flush()
-    saved, sink = [os.dup(1), os.dup(2)], os.open(os.devnull, os.O_WRONLY)
-    os.dup2(sink, 1), os.dup2(sink, 2)
+    if sys.stdout:
+        sys.stdout.flush()
+    saved, sink = {}, os.open(os.devnull, os.O_WRONLY)
+    for file in (1, 2):
+        with contextlib.suppress(OSError):  # it may be closed
+            saved[file] = os.dup(file)
+            os.dup2(sink, file)
     try:
         yield
     finally:
-        os.dup2(saved[0], 1), os.dup2(saved[1], 2)
-        for file in (*saved, sink):
-            os.close(file)
+        for file, copy_ in saved.items():
+            os.dup2(copy_, file)
+            os.close(copy_)
+        os.close(sink)
 
 
 with quiet():
@@ -102,6 +107,7 @@ MAX_TORQUE = 40.0  # Nm
 # Bullet's implicit PD, per physics step. Compliant on purpose: stiff legs fall more often.
 POSITION_GAIN, VELOCITY_GAIN, SOLVER_ITERATIONS = 0.10, 1.0, 10
 STATIC_GROUP = 2  # Bullet's collision group of bodies without mass: terrain and people
+AWAY = -1000.0, 0.0, 0.0  # m, where no terrain is, whatever its heights
 PICTURE = 400, 300  # pixels, width and height of a rendered frame
 
 
@@ -198,7 +204,7 @@ class Simulation:
         with tempfile.NamedTemporaryFile("w", suffix=".urdf") as file:
             file.write(robot_urdf(self.visual))
             file.flush()
-            self.robot = p.loadURDF(file.name, [0, 0, 1000])
+            self.robot = p.loadURDF(file.name, AWAY)
         joints = [p.getJointInfo(self.robot, j) for j in range(p.getNumJoints(self.robot))]
         ids = {joint[1].decode(): joint[0] for joint in joints}
         self.joints = [ids[f"{leg}_{joint}"] for leg in LEGS for joint in JOINTS]
@@ -222,17 +228,17 @@ class Simulation:
                 p.createMultiBody(0, -1, looks, basePosition=origin)
 
     def _add_body(self, kind, colour, radius, height=0.0):
-        """A person or, without a height, a mark that nothing feels; at first far below."""
+        """A person or, without a height, a mark that nothing feels; at first far away."""
         p, shape, looks = self.bullet, -1, -1
         if height:
             shape = p.createCollisionShape(kind, radius=radius, height=height)
         if self.visual:
             looks = p.createVisualShape(kind, radius=radius, length=height, rgbaColor=colour)
-        return p.createMultiBody(0, shape, looks, basePosition=(0, 0, -1000))
+        return p.createMultiBody(0, shape, looks, basePosition=AWAY)
 
     def place(self, position, yaw, joints):
         """Puts the robot down, at rest. What happens next depends on nothing that was before."""
-        self._put((0, 0, 1000), yaw, joints)  # far away first: there Bullet forgets old contacts
+        self._put(AWAY, yaw, joints)  # far away first: there Bullet forgets old contacts
         self.step(joints)
         self._put(position, yaw, joints)
 
@@ -266,9 +272,9 @@ class Simulation:
                                         parentLinkIndex=-1, collisionFilterMask=STATIC_GROUP)
 
     def move_people(self, people, terrain, origin):
-        """Puts the bodies where people are on the terrain; those that are not needed, far below."""
+        """Puts the bodies where people are on the terrain; those that are not needed, far away."""
         for body, person in itertools.zip_longest(self.people, people):
-            place, yaw = (0, 0, -1000), 0.0
+            place, yaw = AWAY, 0.0
             if person:
                 x, y, yaw = person.place()
                 place = (x + origin[0], y, float(terrain.height(x, y)) + Person.HEIGHT / 2)
@@ -557,6 +563,7 @@ def make_env(tasks, seconds=30, **options):
 
 REWARD_SCALE = HOLD * DT  # rewards in metres of progress keep the critic's targets near 1
 LAYOUTS = 8  # terrains of each training environment
+PROGRAM = "python loco_mtrl.py"
 STAGE = 400_000  # steps; then every process starts itself afresh, on new layouts
 
 
@@ -646,6 +653,7 @@ def deaf():
 def launch(args):
     """Starts one process for each rank, as torchrun would, and waits for them."""
     n_ranks = min(args.ranks, PPOConfig.num_envs)
+    os.environ["LOCO_MTRL"] = "loco-mtrl" if Path(sys.argv[0]).name == "loco-mtrl" else PROGRAM
     store = torch.distributed.TCPStore("127.0.0.1", 0, is_master=True, wait_for_workers=False)
     shared = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(store.port), "OMP_NUM_THREADS": "1",
               "WORLD_SIZE": str(n_ranks), "TORCHELASTIC_USE_AGENT_STORE": "True"}
@@ -673,9 +681,9 @@ def launch(args):
 
 
 def again(args):
-    """The command that resumes this run."""
+    """The command that resumes this run, by the name that the user has called."""
     kept = [argument for argument in args.argv or ["train"] if argument != "--resume"]
-    return shlex.join(["python", "loco_mtrl.py", *kept, "--resume"])
+    return f"{os.environ.get('LOCO_MTRL', PROGRAM)} {shlex.join([*kept, '--resume'])}"
 
 
 def tensorboard(run_dir):
@@ -783,7 +791,7 @@ def evaluate(actors, places, n_episodes, workers, first_seed=EVAL_SEED):
     """Scores of every actor in every place: {(actor, place's name): [score's dict, ...]}.
 
     Every episode has an environment of its own, so the scores do not depend on `workers`.
-    Raises RuntimeError if a worker is killed.
+    Raises RuntimeError if a worker is killed, or if a script calls it without a main guard.
     """
     jobs = [(actor, place, first_seed + k)
             for place in places for actor in actors for k in range(n_episodes)]

@@ -98,6 +98,14 @@ def sum_over_ranks(tensor):
     return tensor
 
 
+def gather_from_ranks(thing):
+    """A list of every rank's `thing`."""
+    things = [thing] * (dist.get_world_size() if dist.is_initialized() else 1)
+    if dist.is_initialized():
+        dist.all_gather_object(things, thing)
+    return things
+
+
 def moments(x):
     """Mean and variance of x (B,) over all ranks, two numbers."""
     x = x.double()
@@ -261,10 +269,11 @@ class Collector:
     """This rank's environments, and where they are between two rollouts.
 
     Environment i of all num_envs is on rank i % world: where neighbours are alike, as tasks are,
-    each rank has some of all kinds. Raises ValueError if the spaces are not Box.
+    each rank has some of all kinds. keys: what to note of an episode's last info, beside "return".
+    Raises ValueError if the spaces are not Box.
     """
 
-    def __init__(self, make_env, num_envs, rank, world):
+    def __init__(self, make_env, num_envs, rank, world, keys=()):
         if num_envs < world:
             raise ValueError(f"{num_envs} environments are too few for {world} ranks")
         self.envs = gym.vector.SyncVectorEnv(
@@ -273,7 +282,7 @@ class Collector:
         if not all(isinstance(space, gym.spaces.Box) for space in spaces):
             raise ValueError("both spaces must be Box, but they are {} and {}".format(*spaces))
         self.obs_dim, self.act_dim = (math.prod(space.shape) for space in spaces)
-        self.episodes = deque(maxlen=100)  # the last info of each, and its "return"
+        self.keys, self.episodes = keys, deque(maxlen=100)  # dicts of numbers
         self.generator = torch.Generator()
 
     def reset(self, *seed):
@@ -308,18 +317,20 @@ class Collector:
             self.returned += reward
             for i in np.flatnonzero(self.ended):
                 # Gymnasium pads what an env does not give: its masks, "_name", say who does.
-                given = {k: info[k][i] for k in info if f"_{k}" in info and info[f"_{k}"][i]}
-                self.episodes.append({"return": self.returned[i], **given})
+                given = {key: float(info[key][i]) for key in self.keys
+                         if key in info and info[f"_{key}"][i]}
+                self.episodes.append({"return": float(self.returned[i]), **given})
             self.returned[self.ended] = 0
         obs[-1] = torch.from_numpy(self.next_obs).flatten(1)
         return obs, actions, rewards, terminated, done, prev_done
 
-    def averages(self, keys):
-        """Means of "return" and `keys` over each rank's last 100 episodes; NaN where unknown."""
-        known = [[e[key] for e in self.episodes if key in e] for key in ("return", *keys)]
-        sums = torch.tensor([[float(sum(values)), len(values)] for values in known])
-        totals, counts = sum_over_ranks(sums.double()).T
-        return dict(zip(("return", *keys), (totals / counts).tolist(), strict=True))
+    def averages(self):
+        """Means of "return" and the keys over each rank's last 100 episodes; NaN where unknown."""
+        names = ("return", *self.keys)
+        known = [[e[name] for e in self.episodes if name in e] for name in names]
+        sums = [[sum(values), len(values)] for values in known]
+        totals, counts = sum_over_ranks(torch.tensor(sums, dtype=torch.float64)).T
+        return dict(zip(names, (totals / counts).tolist(), strict=True))
 
 
 # ---------------------------------------------------------------- learning
@@ -529,10 +540,11 @@ class RunFolder:
         rows = [history[0], *(map("{:.10g}".format, row.values()) for row in history)]
         write_whole(self.path / "progress.csv", "\n".join(map(",".join, rows)).encode() + b"\n")
 
-    def save(self, model, optimiser, history):
+    def save(self, model, optimiser, history, episodes):
         """Writes checkpoint.pt and config.json."""
         save(self.path / "checkpoint.pt", kwargs=model.kwargs, model=model.state_dict(),
-             optimiser=optimiser.state_dict(), history=history, meta=self.meta)
+             optimiser=optimiser.state_dict(), history=history, episodes=episodes,
+             meta=self.meta)
         write_whole(self.path / "config.json", self.note.encode() + b"\n")
 
 
@@ -579,7 +591,7 @@ def learn(make_env, config, *, run_dir=None, resume=False, mirror=None, meta=Non
             Gymnasium env with Box spaces. What the env gets is clipped to its action space, and the
             policy's mean lies in (-1, 1): other bounds need gymnasium.wrappers.RescaleAction.
         run_dir: folder of the run's files; None: no files. resume: go on from its checkpoint.
-        mirror: see `update`. episode_keys: see Collector.averages.
+        mirror: see `update`. episode_keys: of an episode's last info, to average; see Collector.
         meta: plain dict kept in the checkpoint; a resumed run's must be equal.
         on_update: called on rank 0 after every update as on_update(model, row of progress.csv).
         stage_end: function of the steps so far to those at which `learn` returns before the end: it
@@ -600,9 +612,12 @@ def learn(make_env, config, *, run_dir=None, resume=False, mirror=None, meta=Non
     end, fresh, stopped = min(stage_end(steps), total), True, False
     with contextlib.ExitStack() as stack:
         stack.enter_context(run.lock if run else contextlib.nullcontext())
-        collector = Collector(partial(make_env, steps=steps), config.num_envs, rank, world)
+        collector = Collector(partial(make_env, steps=steps), config.num_envs, rank, world,
+                              episode_keys)
         stack.enter_context(contextlib.closing(collector.envs))
         model, optimiser = make_model(config, collector, checkpoint)
+        if checkpoint and rank < len(checkpoint["episodes"]):
+            collector.episodes.extend(checkpoint["episodes"][rank])
         interrupted = stack.enter_context(note_interrupt())
         bar = stack.enter_context(tqdm(total=total, initial=steps, unit="step", disable=rank > 0))
         while steps < end and not stopped:
@@ -614,17 +629,18 @@ def learn(make_env, config, *, run_dir=None, resume=False, mirror=None, meta=Non
             n_updates, steps = n_updates + 1, steps + seen
             minutes += (stats["collect_s"] + stats["learn_s"]) / 60
             row = {"update": n_updates, "steps": steps, "minutes": minutes,
-                   **collector.averages(episode_keys), **stats}
+                   **collector.averages(), **stats}
             history.append(row)
             # The first update has a checkpoint, too: from then on nothing is lost.
             fresh = (n_updates == 1 or n_updates % config.checkpoint_every == 0 or stopped
                      or steps >= end)
             bar.update(seen)
             bar.set_postfix({name: f"{row[name]:.3g}" for name in shown})
+            episodes = gather_from_ranks(list(collector.episodes)) if fresh else []
             if run:
                 run.log(history)
             if run and fresh:
-                run.save(model, optimiser, history)
+                run.save(model, optimiser, history, episodes)
             if on_update and rank == 0:
                 on_update(model, row)
     if stopped or interrupted:

@@ -10,6 +10,7 @@ lengths are in metres and all angles in radians unless a name says otherwise.
 
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
+from numbers import Real
 from pathlib import Path
 
 import numpy as np
@@ -495,8 +496,8 @@ def make_terrain(task, rng, difficulty):
 
     task: a name in PILLAR_TASKS, a function (rng, difficulty) -> heights (m, n) in m, or a
     finished Terrain, which is returned as it is. rng: numpy Generator; difficulty: in [0, 1].
-    A function may have attributes: `cell`, m, the pillars' cross-section if it is not L, and
-    `fence`, walls along the border that grow with difficulty.
+    A function may have attributes: `cell`, m, the pillars' cross-section if it is not L; `climb`,
+    m, the highest step on a way if it is not STEP; `fence`, walls along the border.
     Raises ValueError for an unknown task, a difficulty outside [0, 1], heights that are not a
     finite 2-D array or too many for PyBullet, and a task that yields no route in DRAWS draws.
     """
@@ -509,6 +510,9 @@ def make_terrain(task, rng, difficulty):
     generate = task if callable(task) else PILLAR_TASKS[task]
     name, cell = getattr(generate, "__name__", "terrain"), getattr(generate, "cell", L)
     climb = getattr(generate, "climb", STEP)
+    for what, value in (("cell", cell), ("climb", climb)):
+        if not isinstance(value, Real) or not 0.02 <= value <= 10:
+            raise ValueError(f"task {name!r}: {what} must be from 0.02 to 10 m, got {value!r}")
     for _ in range(DRAWS):
         heights = np.array(generate(rng, difficulty), float)
         if heights.ndim != 2 or not heights.size or not np.isfinite(heights).all():

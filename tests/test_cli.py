@@ -261,6 +261,29 @@ def test_ctrl_c_in_eval_prints_no_traceback(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_ctrl_c_in_play_prints_no_traceback_and_leaves_no_file(tmp_path):
+    code, out, error = interrupt(ROOT / "loco_mtrl.py", "1/60 s", "play", "straight", cwd=tmp_path)
+    assert code == 130 and "Stopped." in error and "Traceback" not in error and not out
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_script_without_a_main_guard_ends(tmp_path):
+    """The workers import the script, which must not start workers of its own for ever."""
+    script = tmp_path / "mine.py"
+    script.write_text("from loco_mtrl import evaluate\nevaluate(['zero'], ['flat'], 1, 1)\n")
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=100,
+                          env=os.environ | {"PYTHONPATH": str(ROOT)})
+    assert done.returncode == 1 and "__main__" in done.stderr and "BrokenProcessPool" in done.stderr
+
+
+@pytest.mark.parametrize("closed", ["1", "2", "12"])
+def test_it_can_be_imported_without_output(closed):
+    close = "".join(f"exec {stream}>&-; " for stream in closed)
+    done = subprocess.run(["bash", "-c", f"{close} {sys.executable} -c 'import loco_mtrl'"],
+                          cwd=ROOT, timeout=100)
+    assert done.returncode == 0
+
+
 def test_play_writes_a_gif_that_moves(scan, tmp_path, capsys, monkeypatch):
     Image = pytest.importorskip("PIL.Image")
     monkeypatch.setattr(loco_mtrl, "EVAL_SECONDS", 3)

@@ -382,6 +382,24 @@ def test_resets_leak_no_memory(flat):
     assert sizes[-1] - sizes[0] < 1e6
 
 
+@pytest.mark.parametrize("height", [-2000, -1000, 1000])
+def test_the_walk_is_the_same_at_any_height(height):
+    """To a tenth of a millimetre, for that is what Bullet's floats leave of a kilometre."""
+    def walk(height):
+        def plain(rng, difficulty):
+            return np.full((60, 40), float(height))
+
+        with closing(LocoEnv(plain)) as env:
+            scan = env.reset(seed=0)[0][:160]
+            for _ in range(5):
+                env.step(np.zeros(17))
+            return scan, np.subtract(env.robot.position, (*env.origin[:2], height))
+
+    (scan, place), (other, elsewhere) = walk(0), walk(height)
+    np.testing.assert_allclose(scan, other, atol=1e-3)
+    np.testing.assert_allclose(place, elsewhere, atol=0.02)
+
+
 def test_options_choose_terrain_and_route():
     with closing(LocoEnv(["flat", wall_ahead, "stairs"])) as env:
         for terrain, route in ((2, 7), (1, 0), (0, 3)):

@@ -61,6 +61,15 @@ def go_on(folder, **options):
     return train(folder, resume=(folder / "checkpoint.pt").exists(), **options)
 
 
+def test_means_go_on_after_a_resume(tmp_path):
+    """Those of episodes that ended before the checkpoint count as if nothing had stopped."""
+    train(tmp_path / "a")
+    train(tmp_path / "b", stop=1)
+    train(tmp_path / "b", resume=True)
+    columns = [[row["return"] for row in table(tmp_path / name)] for name in "ab"]
+    assert columns[0] == columns[1] and len(set(columns[0])) == 3
+
+
 @pytest.fixture(scope="module")
 def unbroken(tmp_path_factory):
     """Parameters after three updates that nothing has stopped."""
@@ -376,13 +385,18 @@ def test_a_killed_rank_ends_the_training_with_one_message(job, tmp_path):
     assert ppo.load_checkpoint(tmp_path / "run" / "checkpoint.pt")["history"][-1]["update"] >= 1
 
 
-def test_killed_ranks_are_all_named(tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize("program", ["loco-mtrl", "python loco_mtrl.py"])
+def test_killed_ranks_are_all_named_and_the_program_as_it_was_called(
+        tmp_path, monkeypatch, capsys, program):
     (tmp_path / "job.py").write_text("import os; os.kill(os.getpid(), 9)")
     monkeypatch.setattr(loco_mtrl, "__file__", str(tmp_path / "job.py"))
+    monkeypatch.setattr(sys, "argv", [f"/somewhere/{program.split()[-1]}", "train"])
+    monkeypatch.setenv("LOCO_MTRL", "")  # put back after the test
     assert loco_mtrl.main(["train", "--ranks", "2"]) == 9
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 2 and all(
         f"error: rank {k} was killed by signal 9" in line for k, line in enumerate(lines))
+    assert all(line.endswith(f"checkpoint: {program} train --ranks 2 --resume") for line in lines)
 
 
 @pytest.fixture(scope="module")

@@ -383,12 +383,12 @@ def test_averages_leave_out_what_nobody_said():
     infos = ([{"task": "left", "t_cr": 0.5}, {"task": "left", "t_cr": 1.0, "success": True}],
              [{"task": "right", "t_cr": 0.0}] * 2)
     # Returns 1 + 2, then 3 + 4, which ends with the other's 1 + 2 + 3 + 4 + 5.
-    collector = Collector(lambda index: Script(2 + 3 * index, False, infos[index]), 2, 0, 1)
-    names = ("t_cr", "success", "fall")
+    collector = Collector(lambda index: Script(2 + 3 * index, False, infos[index]), 2, 0, 1,
+                          ("t_cr", "success", "fall"))
     collector.reset(0)
-    assert all(math.isnan(mean) for mean in collector.averages(names).values())
+    assert all(math.isnan(mean) for mean in collector.averages().values())
     collector.collect(ActorCritic(1, 2), 5)
-    means = collector.averages(names)
+    means = collector.averages()
     assert means == pytest.approx(
         {"return": (3 + 7 + 15) / 3, "t_cr": 0.5, "success": 1.0, "fall": math.nan},
         nan_ok=True)

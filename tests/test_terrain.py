@@ -758,3 +758,14 @@ def test_own_terrains_beyond_pybullets_limit_are_named():
     gravel.cell = 0.05
     with pytest.raises(ValueError, match="gravel is too large for PyBullet"):
         make_terrain(gravel, np.random.default_rng(0), 0.5)
+
+
+@pytest.mark.parametrize("name", ["cell", "climb"])
+@pytest.mark.parametrize("value", [(0.2, 0.1), "x", None, 0, -1, 1e-9, np.nan, np.inf])
+def test_own_terrains_with_a_bad_cell_or_climb_are_named(name, value):
+    def mine(rng, difficulty):
+        return np.zeros((60, 40))
+
+    setattr(mine, name, value)
+    with pytest.raises(ValueError, match=rf"task 'mine': {name} must be from 0.02 to 10 m"):
+        make_terrain(mine, np.random.default_rng(0), 0.5)
