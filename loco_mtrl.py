@@ -756,6 +756,16 @@ def load_actor(name):
     return model.mean_action, options, next(kind for kind, holds in kinds.items() if holds)
 
 
+def open_scan(args):
+    """The scan that --scan names; says what was taken for its floor."""
+    scan = load_scan(args.scan, args.scale, args.up)
+    low, high = scan.vertices.min(0), scan.vertices.max(0)
+    size = " x ".join(f"{side:.1f}" for side in high - low)
+    print(f"{scan.name}: {size} m; its floor lies {abs(low[2]):.2f} m above the lowest point",
+          file=sys.stderr)
+    return scan
+
+
 def make_place(place, seed):
     """The terrain of episode `seed`: of a world, a task on held-out seeds, or a given one."""
     if isinstance(place, Terrain):
@@ -815,7 +825,7 @@ def evaluate(actors, places, n_episodes, workers, first_seed=EVAL_SEED):
 def eval_command(args):
     """`eval`: the table of the paper for one or more policies."""
     kinds = {load_actor(actor)[2] for actor in args.policies}
-    places = [load_scan(args.scan, args.scale, args.up)] if args.scan else args.worlds
+    places = [open_scan(args)] if args.scan else args.worlds
     if args.json:  # a bad place is named before any work
         check_writable(args.json)
     scores = evaluate(args.policies, places, args.episodes, args.ranks)
@@ -884,7 +894,7 @@ def draw_map(axis, terrain):
 def play(args):
     """`play`: one episode in PyBullet's window, or as a GIF."""
     load_actor(args.policy)  # what is wrong is named before the work
-    place = load_scan(args.scan, args.scale, args.up) if args.scan else args.world
+    place = open_scan(args) if args.scan else args.world
     options = {"gui": True} if args.gui else {"render_mode": "rgb_array"}
     if not args.gui:
         from PIL import Image

@@ -8,6 +8,8 @@ Frame: x runs along the m pillars from 0, y along the n pillars with 0 in the mi
 lengths are in metres and all angles in radians unless a name says otherwise.
 """
 
+import io
+import re
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from numbers import Real
@@ -805,7 +807,10 @@ def read_scan(path, scale, up):
     import trimesh
 
     try:
-        mesh = trimesh.load(path, force="mesh")
+        content, kind = Path(path).read_bytes(), Path(path).suffix[1:]
+        if kind == "obj":  # trimesh takes no remark behind a face
+            content = re.sub(rb"#.*", b"", content)
+        mesh = trimesh.load(io.BytesIO(content), file_type=kind, force="mesh")
         corners = np.array(mesh.triangles)[..., [2, 0, 1] if up == "y" else [0, 1, 2]] * scale
     except Exception as error:  # trimesh raises many kinds
         raise ValueError(f"{path} is not a mesh: {error}") from None

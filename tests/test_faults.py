@@ -385,6 +385,27 @@ def test_a_killed_rank_ends_the_training_with_one_message(job, tmp_path):
     assert ppo.load_checkpoint(tmp_path / "run" / "checkpoint.pt")["history"][-1]["update"] >= 1
 
 
+def test_after_ctrl_c_a_slow_rank_gets_all_the_time_that_its_update_takes(monkeypatch):
+    class Rank:
+        def __init__(self, command, env):
+            self.code = 130 if env["RANK"] == "0" else None
+
+        def poll(self):
+            return self.code
+
+        def wait(self, timeout):
+            waits.append(timeout)
+            self.code = 130
+
+        def kill(self):
+            assert self.code == 130
+
+    waits = []
+    monkeypatch.setattr(loco_mtrl.subprocess, "Popen", Rank)
+    assert loco_mtrl.main(["train", "--ranks", "2"]) == 130
+    assert waits == [None, None]
+
+
 @pytest.mark.parametrize("program", ["loco-mtrl", "python loco_mtrl.py"])
 def test_killed_ranks_are_all_named_and_the_program_as_it_was_called(
         tmp_path, monkeypatch, capsys, program):

@@ -654,6 +654,44 @@ def test_a_scanned_room_is_walked_on_its_floor(file, ceiling, change, options, t
     assert start[2] == goal[2] == pytest.approx(below[0], abs=1e-3)
 
 
+HOLED = [level(x, y, x + 0.5, y + 0.5, 0) for x in np.arange(0, 8, 0.5)
+         for y in np.arange(0, 6, 0.5) if rng(int(100 * x + y)).random() > 0.1]
+
+
+@pytest.mark.parametrize("parts", [
+    [*HOLED, *room()[1:], *TABLES], room(*TABLES, level(-1, -1, 9, 7, 2.8)),
+    [level(0, 0, 8, 6, z) for z in np.arange(0, 20, 0.5)]], ids=["holes", "flat roof", "sheets"])
+def test_floors_under_something_odd(parts, tmp_path):
+    place = load_scan(saved(tmp_path / "a.obj", parts))
+    check_route(place, place.starts[0], place.goals[0], 4, 12)
+    assert place.starts[0, 2] == pytest.approx(0, abs=1e-6)
+    assert place.vertices[:, 2].max() < 21
+
+
+@pytest.mark.parametrize("start, end, face", [
+    ("", "", "f %d %d %d"), ("\ufeff# a byte order mark\n", "", "f %d %d %d"),
+    ("", "", "f %d %d \\\n %d"), ("", "", "f %d %d %d # a remark"),
+    ("", "v -500000 -5000000 0\n", "f %d %d %d"),  # which no face uses
+], ids=["plain", "byte order mark", "continued", "remark", "unused vertex"])
+def test_odd_but_legal_files_are_read(start, end, face, tmp_path):
+    vertices, triangles = terrain.join(room(*TABLES))
+    lines = ["v {:.3f} {:.3f} {:.3f}".format(*vertex) for vertex in vertices]
+    lines += [face % tuple(triangle + 1) for triangle in triangles]
+    (tmp_path / "a.obj").write_text(start + "\n".join(lines) + "\n" + end)
+    place = load_scan(tmp_path / "a.obj")
+    np.testing.assert_allclose(np.ptp(place.vertices, 0), (8, 6, 2.5), atol=1e-3)
+    check_route(place, place.starts[0], place.goals[0], 4, 12)
+
+
+def test_a_scan_in_millimetres_is_named_and_a_wide_one_is_cut(tmp_path):
+    path = saved(tmp_path / "a.obj", room(), lambda corners: 1000 * corners)
+    with pytest.raises(ValueError, match="a.obj is more than 1000 m wide: is scale 1.0 right"):
+        load_scan(path)
+    ground = terrain.triangulate(np.zeros((61, 61)), 10.0)  # 600 m
+    place = load_scan(saved(path, [ground]))
+    assert max(place.heights.shape) <= 401
+
+
 def test_the_floor_is_the_storey_with_most_room(tmp_path):
     """Below, 48 m^2 have something above them; above, one half does. Walls may count as not."""
     parts = [*room(*TABLES), level(0, 0, 8, 6, 2.7), level(0, 0, 4, 6, 5)]
