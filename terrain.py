@@ -808,8 +808,10 @@ def read_scan(path, scale, up):
 
     try:
         content, kind = Path(path).read_bytes(), Path(path).suffix[1:]
-        if kind == "obj":  # trimesh takes no remark behind a face
-            content = re.sub(rb"#.*", b"", content)
+        if kind == "obj":  # trimesh takes no remark behind a face, and every face to be convex
+            content = re.sub(rb"#.*|\\\r?\n", b"", content)
+            if re.search(rb"^ *f([ \t]+\S+){5}", content, re.M):
+                raise ValueError("it has faces of more than four corners: triangulate it first")
         mesh = trimesh.load(io.BytesIO(content), file_type=kind, force="mesh")
         corners = np.array(mesh.triangles)[..., [2, 0, 1] if up == "y" else [0, 1, 2]] * scale
     except Exception as error:  # trimesh raises many kinds

@@ -757,6 +757,8 @@ CORNERS = "v 0 0 0\nv 9 0 0\nv 9 9 0\nv 0 9 0\n"
 
 
 @pytest.mark.parametrize("text, options, named", [
+    ("v 9 9 0\nv 3 9 0\nv 3 3 0\nv 0 3 0\nv 0 0 0\nv 9 0 0\nf 1 2 3 4 5 6\n", {},
+     "more than four corners: triangulate it first"),  # an L, whose fan of triangles is no L
     ("", {}, "a.obj.* 0 triangles"), ("no mesh at all", {}, "a.obj"), (CORNERS, {}, "0 triangles"),
     (CORNERS + "f 1 2 9\n", {}, "a.obj"), ("v nan 0 0\n" + CORNERS + "f 1 2 3\n", {}, "finite"),
     ("v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\nf 1 2 3\n", {}, "no floor"),
