@@ -450,7 +450,8 @@ def test_an_update_reports_and_uses_what_its_rollout_holds(bound, losses):
         values = model.value(rollout[0])
     kept = ~rollout[-1]
     raw, returns = (x[kept].double().numpy()
-                    for x in compute_gae(rollout[2], values, *rollout[3:], 0.995, 0.95))
+                    for x in compute_gae(rollout[2], values, *rollout[3:],
+                                               config.gamma, config.gae_lambda))
     stats = ppo.update(model, optimiser, rollout, config, torch.Generator(), 0.03)
     expected = ((raw - raw.mean()) / raw.std()).clip(-bound, bound)
     expected -= expected.mean()
