@@ -17,7 +17,7 @@ from ppo import load_checkpoint
 
 
 def main(out, *checkpoints):
-    minutes = [load_checkpoint(name)["counters"][2] for name in checkpoints]
+    minutes = [load_checkpoint(name)["history"][-1]["minutes"] for name in checkpoints]
     figure = Figure(figsize=(8, 3.6), layout="constrained")
     axis = figure.subplots()
     for label, places, episodes in (("tasks", PILLAR_TASKS, 2), ("unseen worlds", WORLDS, 5)):
