@@ -107,7 +107,8 @@ MAX_TORQUE = 40.0  # Nm
 # Bullet's implicit PD, per physics step. Compliant on purpose: stiff legs fall more often.
 POSITION_GAIN, VELOCITY_GAIN, SOLVER_ITERATIONS = 0.10, 1.0, 10
 STATIC_GROUP = 2  # Bullet's collision group of bodies without mass: terrain and people
-AWAY = -1000.0, 0.0, 0.0  # m, where no terrain is, whatever its heights
+# m, where no terrain is, whatever its heights: for the robot, and for people who are not needed.
+AWAY, PARKED = (-1000.0, 0.0, 0.0), (-2000.0, 0.0, 0.0)
 PICTURE = 400, 300  # pixels, width and height of a rendered frame
 
 
@@ -234,7 +235,7 @@ class Simulation:
             shape = p.createCollisionShape(kind, radius=radius, height=height)
         if self.visual:
             looks = p.createVisualShape(kind, radius=radius, length=height, rgbaColor=colour)
-        return p.createMultiBody(0, shape, looks, basePosition=AWAY)
+        return p.createMultiBody(0, shape, looks, basePosition=PARKED)
 
     def place(self, position, yaw, joints):
         """Puts the robot down, at rest. What happens next depends on nothing that was before."""
@@ -274,7 +275,7 @@ class Simulation:
     def move_people(self, people, terrain, origin):
         """Puts the bodies where people are on the terrain; those that are not needed, far away."""
         for body, person in itertools.zip_longest(self.people, people):
-            place, yaw = AWAY, 0.0
+            place, yaw = PARKED, 0.0
             if person:
                 x, y, yaw = person.place()
                 place = (x + origin[0], y, float(terrain.height(x, y)) + Person.HEIGHT / 2)
@@ -568,7 +569,7 @@ STAGE = 400_000  # steps; then every process starts itself afresh, on new layout
 
 
 def stage(steps, args):
-    """Where a step lies: (new layouts so far, index of the task with --sequential, last step)."""
+    """Where a step lies: (new layouts so far, index of the task with --sequential, its end)."""
     n = len(args.tasks) if args.sequential else 1
     layouts, task = steps // STAGE, min(n * steps // args.steps, n - 1)
     return layouts, task, min((layouts + 1) * STAGE, math.ceil((task + 1) * args.steps / n))
@@ -601,19 +602,31 @@ def train(args):
     config = PPOConfig(
         total_timesteps=args.steps, seed=args.seed, n_scan=N_RAYS * args.lidar,
         init_std=tuple(part.std for part in action for _ in range(part.size)))
+    writer = None
+    if args.tensorboard and first:
+        from torch.utils.tensorboard import SummaryWriter
+
+        writer = SummaryWriter(run_dir)
+
+    def on_update(model, row):
+        tasks = stage(row["steps"], args)[1]  # done, with --sequential: what do they leave?
+        if tasks and not (run_dir / f"policy-{tasks}.pt").exists():
+            save_policy(run_dir / f"policy-{tasks}.pt", model, meta)
+        if writer:
+            for name, value in row.items():
+                writer.add_scalar(name, value, row["steps"])
+            writer.flush()
+
     try:
         model, steps = learn(
             functools.partial(training_env, args=args), config, run_dir=run_dir, meta=meta,
             resume=args.resume or stages > 0 or crashed and checkpoint.exists(),
             mirror=(mirror(observation), mirror(action)), stage_end=lambda n: stage(n, args)[2],
-            episode_keys=("t_cr", "success", "fall", "exploded"),
-            on_update=tensorboard(run_dir) if args.tensorboard and first else None)
+            episode_keys=("t_cr", "success", "fall", "exploded"), on_update=on_update)
     except KeyboardInterrupt:
         if first:
             print(f"\nStopped. To go on: {again(args)}" if checkpoint.exists() else "\nStopped.")
         return 130
-    if first and args.sequential:  # what each task leaves of the ones before it
-        save_policy(run_dir / f"policy-{steps}.pt", model, meta)
     if steps < args.steps:  # Bullet gives no memory back but to a new process
         if torch.distributed.is_initialized():
             torch.distributed.destroy_process_group()
@@ -681,23 +694,9 @@ def launch(args):
 
 
 def again(args):
-    """The command that resumes this run, by the name that the user has called."""
+    """The command that resumes this run, by the program that the user has called."""
     kept = [argument for argument in args.argv or ["train"] if argument != "--resume"]
     return f"{os.environ.get('LOCO_MTRL', PROGRAM)} {shlex.join([*kept, '--resume'])}"
-
-
-def tensorboard(run_dir):
-    """An `on_update` for `learn` that also writes progress.csv's columns for TensorBoard."""
-    from torch.utils.tensorboard import SummaryWriter
-
-    writer = SummaryWriter(run_dir)
-
-    def on_update(_, row):
-        for name, value in row.items():
-            writer.add_scalar(name, value, row["steps"])
-        writer.flush()
-
-    return on_update
 
 
 # ------------------------------------------------------------------------------- eval

@@ -38,7 +38,7 @@ class PPOConfig:
     """The settings of PPO; the defaults are the main job's, to which `train` adds n_scan, init_std.
 
     Of two values the first holds at the beginning of the training and the second at its end; in
-    between it falls linearly. Raises ValueError that names a bad value.
+    between it falls linearly. Raises ValueError that names a value out of range.
     """
 
     total_timesteps: int = 600_000  # environment steps over all ranks, resets not counted
@@ -64,7 +64,7 @@ class PPOConfig:
 
     def __post_init__(self):
         for name, value in vars(self).items():
-            least = 0 if name in ("gamma", "gae_lambda", "noise", "n_scan", "seed") else 1e-9
+            least = 0 if name in ("gamma", "gae_lambda", "n_scan", "seed") else 1e-9
             most = 1 if name in ("gamma", "gae_lambda") else 2**53
             values = np.atleast_1d(value)
             if not len(values) or not ((least <= values) & (values <= most)).all():
@@ -100,8 +100,8 @@ def sum_over_ranks(tensor):
 
 def gather_from_ranks(thing):
     """A list of every rank's `thing`."""
-    things = [thing] * (dist.get_world_size() if dist.is_initialized() else 1)
-    if dist.is_initialized():
+    things = [thing] * join_ranks()[1]
+    if len(things) > 1:
         dist.all_gather_object(things, thing)
     return things
 
@@ -373,6 +373,8 @@ def update(model, optimiser, rollout, config, generator, target_kl, mirror=None)
         advantages, returns = advantages.repeat(2), returns.repeat(2)
     with torch.no_grad():
         old_log_prob = model.log_prob(obs, actions)
+    if len(obs) < config.num_minibatches:
+        raise ValueError(f"{len(obs)} rows are too few for {config.num_minibatches} minibatches")
 
     for _epoch in range(config.update_epochs):
         stats = torch.zeros(3)  # value loss, approx_kl, clipfrac
@@ -550,6 +552,8 @@ class RunFolder:
 
 def open_run(run_dir, config, meta, resume):
     """(RunFolder or None, checkpoint or None): rank 0 opens the folder, all know what it held."""
+    if resume and run_dir is None:
+        raise ValueError("resume = True, but there is no run_dir to go on from")
     run, found = None, [None]
     rank, _ = join_ranks()
     if run_dir is not None and rank == 0:
@@ -607,7 +611,7 @@ def learn(make_env, config, *, run_dir=None, resume=False, mirror=None, meta=Non
     rank, world = join_ranks()
     run, checkpoint = open_run(run_dir, config, meta, resume)
     history = checkpoint["history"] if checkpoint else []
-    n_updates, steps, minutes = list(history[-1].values())[:3] if history else (0, 0, 0.0)
+    steps, minutes = (history[-1]["steps"], history[-1]["minutes"]) if history else (0, 0.0)
     total, shown = config.total_timesteps, ["return", *episode_keys[:1]]
     end, fresh, stopped = min(stage_end(steps), total), True, False
     with contextlib.ExitStack() as stack:
@@ -622,18 +626,18 @@ def learn(make_env, config, *, run_dir=None, resume=False, mirror=None, meta=Non
         bar = stack.enter_context(tqdm(total=total, initial=steps, unit="step", disable=rank > 0))
         while steps < end and not stopped:
             if fresh:
-                collector.reset(config.seed, n_updates, rank)
+                collector.reset(config.seed, len(history), rank)
             stats, seen = iterate(model, optimiser, collector, config, steps / total, mirror)
             sums = sum_over_ranks(torch.tensor([seen, bool(interrupted)], dtype=torch.float64))
             seen, stopped = sums.long().tolist()  # one Ctrl-C stops all ranks
-            n_updates, steps = n_updates + 1, steps + seen
+            steps += seen
             minutes += (stats["collect_s"] + stats["learn_s"]) / 60
-            row = {"update": n_updates, "steps": steps, "minutes": minutes,
+            row = {"update": len(history) + 1, "steps": steps, "minutes": minutes,
                    **collector.averages(), **stats}
             history.append(row)
-            # The first update has a checkpoint, too: from then on nothing is lost.
-            fresh = (n_updates == 1 or n_updates % config.checkpoint_every == 0 or stopped
-                     or steps >= end)
+            # The first update has a checkpoint, too: from then on a run can be resumed.
+            fresh = len(history) % config.checkpoint_every == 0 or len(history) == 1
+            fresh = fresh or stopped or steps >= end
             bar.update(seen)
             bar.set_postfix({name: f"{row[name]:.3g}" for name in shown})
             episodes = gather_from_ranks(list(collector.episodes)) if fresh else []

@@ -383,12 +383,13 @@ slopes.cell = L / 8
 
 
 def ridges(rng, difficulty):
-    """Up to 10 ridges, 1-4 m wide and to 1 m high, with flanks of 20-50 degrees at most."""
+    """Up to 10 ridges, 1-4 m wide and up to 1 m high, with flanks of up to 50 degrees."""
     x, y, u = _grid(ridges.cell)
     h = np.zeros(x.shape)
     for _ in range(round(10 * difficulty)):
         x0, y0, half = rng.uniform(2.5, 9.5), rng.uniform(-4, 4), rng.uniform(0.5, 2.0)
-        steep, top = np.tan(np.radians(rng.uniform(20, 50) * difficulty)), rng.uniform(0.3, 1.0)
+        steep = np.tan(np.radians(rng.uniform(20, 50) * difficulty))
+        top = rng.uniform(0.3, 1.0) * difficulty
         ridge = np.where(np.abs(y - y0) <= half, top - steep * np.abs(x - x0), 0.0)
         h = np.maximum(h, ridge)
     return h
@@ -807,12 +808,13 @@ def read_scan(path, scale, up):
     import trimesh
 
     try:
-        content, kind = Path(path).read_bytes(), Path(path).suffix[1:]
+        file, kind = str(path), Path(path).suffix[1:].lower()
         if kind == "obj":  # trimesh takes no remark behind a face, and every face to be convex
-            content = re.sub(rb"#.*|\\\r?\n", b"", content)
+            content = re.sub(rb"#.*|\\\r?\n", b"", Path(path).read_bytes())
+            file = io.BytesIO(content)
             if re.search(rb"^ *f([ \t]+\S+){5}", content, re.M):
                 raise ValueError("it has faces of more than four corners: triangulate it first")
-        mesh = trimesh.load(io.BytesIO(content), file_type=kind, force="mesh")
+        mesh = trimesh.load(file, file_type=kind, force="mesh")
         corners = np.array(mesh.triangles)[..., [2, 0, 1] if up == "y" else [0, 1, 2]] * scale
     except Exception as error:  # trimesh raises many kinds
         raise ValueError(f"{path} is not a mesh: {error}") from None

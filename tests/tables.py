@@ -70,11 +70,10 @@ def train(row, seed, folder, steps):
     return run / "policy.pt"
 
 
-def score(row, seed, policy, places, episodes):
-    """A policy's rows of results.csv, one a place."""
-    history = load_checkpoint(policy.parent / "checkpoint.pt")["history"]
-    steps = int(policy.stem.partition("-")[2] or history[-1]["steps"])  # policy-STEPS.pt, a stage's
-    minutes = next(update["minutes"] for update in history if update["steps"] == steps)
+def score(row, seed, policy, places, episodes, share=1.0):
+    """A policy's rows of results.csv, one a place. share: of its training that was done."""
+    last = load_checkpoint(policy.parent / "checkpoint.pt")["history"][-1]
+    steps, minutes = round(share * last["steps"]), share * last["minutes"]
     commit = subprocess.run(["git", "describe", "--always", "--dirty"], cwd=ROOT, text=True,
                             capture_output=True).stdout.strip()
     scores = evaluate([str(policy)], places, episodes, os.cpu_count())
@@ -124,16 +123,16 @@ def tables(results):
 
 
 def forgetting(results):
-    """What sequential training leaves of its first tasks, as Markdown: t_cr after each stage."""
+    """What sequential training leaves of its first tasks, as Markdown: t_cr after n tasks."""
     table = {}
     for result in results:
         if result["world"] in FIRST:
-            row = table.setdefault(round(int(result["steps"]), -4), {})  # alike for all seeds
-            row.setdefault(result["world"], []).append(float(result["t_cr"]))
-    lines = [f"| steps | {' | '.join(FIRST)} |", "|---" * (len(FIRST) + 1) + "|"]
-    for steps in sorted(table):
-        cells = [f"{np.mean(table[steps][task]):.2f}" for task in FIRST]
-        lines.append(f"| {steps} | {' | '.join(cells)} |")
+            row = table.setdefault(result["row"], {task: [] for task in FIRST})
+            row[result["world"]].append(float(result["t_cr"]))
+    lines = [f"| | {' | '.join(FIRST)} |", "|---" * (len(FIRST) + 1) + "|"]
+    for name in sorted(table, key=lambda name: int(name.split()[1])):
+        cells = [f"{np.mean(t_cr):.2f}" for t_cr in table[name].values()]
+        lines.append(f"| {name} | {' | '.join(cells)} |")
     return "\n".join(["**Forgetting**: t_cr on the first tasks, in sequence", "", *lines, ""])
 
 
@@ -169,8 +168,11 @@ def main(argv=None):
         if (row, str(seed)) not in {(r["row"], r["seed"]) for r in read(out / "results.csv")}:
             policy = train(row, seed, runs, steps)
             rows = score(row, seed, policy, list(WORLDS), episodes)
-            for stage in policy.parent.glob("policy-*.pt"):  # of sequential training, after a task
-                rows += score(row, seed, stage, FIRST, episodes)
+            for n in range(1, len(PILLAR_TASKS)):  # what sequential training left after n tasks
+                after = policy.with_name(f"policy-{n}.pt")
+                if after.exists():
+                    rows += score(f"after {n} tasks", seed, after, FIRST, episodes,
+                                  n / len(PILLAR_TASKS))
             append(out / "results.csv", rows)
     results = read(out / "results.csv")
     print(tables(results), forgetting(results), sep="\n")

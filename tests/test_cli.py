@@ -132,8 +132,8 @@ def test_sequential_training_takes_each_task_in_a_new_process(small, monkeypatch
     assert stages == [(0, "flat")] * 2 + [(32, "stairs")] * 2
     assert [int(row["steps"]) for row in progress(tmp_path / "runs/main")] == [32, 64]
     assert loco_mtrl.load_actor(str(tmp_path / "runs/main/policy.pt"))[2] == "sequential"
-    stages = [ppo.load_policy(tmp_path / f"runs/main/policy-{n}.pt")[0] for n in (32, 64)]
-    assert stages[0].normaliser.count == 2 * 32 and stages[1].normaliser.count == 2 * 64
+    first, _ = ppo.load_policy(tmp_path / "runs/main/policy-1.pt")  # after one task
+    assert first.normaliser.count == 2 * 32
 
 
 def test_resume_goes_on_and_so_does_a_longer_run(small, trained, tmp_path, capsys):

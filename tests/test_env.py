@@ -384,7 +384,7 @@ def test_resets_leak_no_memory(flat):
 
 @pytest.mark.parametrize("height", [-2000, -1000, 1000])
 def test_the_walk_is_the_same_at_any_height(height):
-    """To a tenth of a millimetre, for that is what Bullet's floats leave of a kilometre."""
+    """To 2 cm, for Bullet's floats leave a tenth of a millimetre of a kilometre at each step."""
     def walk(height):
         def plain(rng, difficulty):
             return np.full((60, 40), float(height))

@@ -109,6 +109,7 @@ def in_ranks(world, function, seconds=60):
     ("target_kl", (0.03, 0.0)), ("learning_rate", 0.0), ("critic_learning_rate", -1e-3),
     ("init_std", -1), ("init_std", (0.1, 0.0)), ("init_std", ()), ("noise", (1.0, math.nan)),
     ("n_scan", -1), ("hidden", ()), ("hidden", (64, 0)), ("seed", -1),
+    ("noise", (1, 0)),
 ])
 def test_bad_settings_are_named(name, value):
     with pytest.raises(ValueError) as error:

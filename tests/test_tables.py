@@ -30,11 +30,12 @@ def test_tables_by_hand():
 
 
 def test_forgetting_by_hand():
-    scores = ("9990", "0.5"), ("10080", "0.7"), ("20000", "0.1")
-    told = [{"world": task, "steps": steps, "t_cr": t_cr}
-            for steps, t_cr in scores for task in ("flat", "rugged", "holes")]
-    lines = tables.forgetting(told).splitlines()
-    assert lines[-2:] == ["| 10000 | 0.60 | 0.60 | 0.60 |", "| 20000 | 0.10 | 0.10 | 0.10 |"]
+    scores = ("after 10 tasks", "0.1"), ("after 9 tasks", "0.5"), ("after 9 tasks", "0.7")
+    told = [{"world": task, "row": row, "t_cr": t_cr}
+            for row, t_cr in scores for task in ("flat", "rugged", "holes")]
+    lines = tables.forgetting(told + results(ours=(0.9,))).splitlines()
+    assert lines[-2:] == ["| after 9 tasks | 0.60 | 0.60 | 0.60 |",
+                          "| after 10 tasks | 0.10 | 0.10 | 0.10 |"]
 
 
 def test_readme_shows_the_tables_of_the_results():

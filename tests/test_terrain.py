@@ -683,6 +683,18 @@ def test_odd_but_legal_files_are_read(start, end, face, tmp_path):
     check_route(place, place.starts[0], place.goals[0], 4, 12)
 
 
+def test_suffixes_may_be_upper_case_and_files_lie_in_pieces(tmp_path):
+    lines = saved(tmp_path / "a.obj", room(*TABLES)).read_text().splitlines()
+    remarks = [line + " # a remark" * line.startswith("f") for line in lines]
+    (tmp_path / "a.OBJ").write_text("\n".join(remarks))
+    mesh = trimesh.load(tmp_path / "a.obj", force="mesh")
+    for name, data in trimesh.exchange.gltf.export_gltf(trimesh.Scene(mesh)).items():
+        (tmp_path / name).write_bytes(data)
+    for name in ("a.OBJ", "model.gltf"):
+        place = load_scan(tmp_path / name)
+        np.testing.assert_allclose(np.ptp(place.vertices, 0), (8, 6, 2.5), atol=1e-3)
+
+
 def test_a_scan_in_millimetres_is_named_and_a_wide_one_is_cut(tmp_path):
     path = saved(tmp_path / "a.obj", room(), lambda corners: 1000 * corners)
     with pytest.raises(ValueError, match="a.obj is more than 1000 m wide: is scale 1.0 right"):
