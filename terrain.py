@@ -384,14 +384,13 @@ slopes.cell = L / 8
 
 def ridges(rng, difficulty):
     """Up to 10 ridges, 1-4 m wide and up to 1 m high, with flanks of up to 50 degrees."""
-    x, y, u = _grid(ridges.cell)
+    x, y, _ = _grid(ridges.cell)
     h = np.zeros(x.shape)
     for _ in range(round(10 * difficulty)):
-        x0, y0, half = rng.uniform(2.5, 9.5), rng.uniform(-4, 4), rng.uniform(0.5, 2.0)
-        steep = np.tan(np.radians(rng.uniform(20, 50) * difficulty))
-        top = rng.uniform(0.3, 1.0) * difficulty
-        ridge = np.where(np.abs(y - y0) <= half, top - steep * np.abs(x - x0), 0.0)
-        h = np.maximum(h, ridge)
+        x0, y0, half = rng.uniform((2.5, -4, 0.5), (9.5, 4, 2.0))
+        top, degrees = rng.uniform((0.3, 20), (1.0, 50)) * difficulty
+        flanks = top - np.tan(np.radians(degrees)) * np.abs(x - x0)
+        h = np.where(np.abs(y - y0) <= half, np.maximum(h, flanks), h)
     return h
 
 
