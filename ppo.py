@@ -41,7 +41,7 @@ class PPOConfig:
     between it falls linearly. Raises ValueError that names a value out of range.
     """
 
-    total_timesteps: int = 600_000  # environment steps over all ranks, resets not counted
+    total_timesteps: int = 300_000  # environment steps over all ranks, resets not counted
     num_envs: int = 34  # environments over all ranks
     num_steps: int = 128  # steps of each environment between two updates
     gamma: float = 0.998  # discount per step
