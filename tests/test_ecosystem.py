@@ -68,13 +68,18 @@ def test_stable_baselines_trains_on_it_unchanged():
     env.close()
 
 
-def test_tensorboard_gets_the_columns_of_progress(tmp_path):
+def test_tensorboard_gets_the_columns_of_progress(tmp_path, monkeypatch):
     pytest.importorskip("tensorboard")
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-    on_update = loco_mtrl.tensorboard(tmp_path)
-    on_update(None, {"steps": 10, "t_cr": 0.25})
-    on_update(None, {"steps": 20, "t_cr": 0.5})
+    def learn(*_, on_update, **__):
+        on_update(None, {"steps": 10, "t_cr": 0.25})
+        on_update(None, {"steps": 20, "t_cr": 0.5})
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(loco_mtrl, "learn", learn)
+    monkeypatch.setenv("RANK", "0")
+    assert loco_mtrl.main(["train", "--tensorboard", "--run-dir", str(tmp_path)]) == 130
     events = EventAccumulator(str(tmp_path)).Reload()
     assert [(e.step, e.value) for e in events.Scalars("t_cr")] == [(10, 0.25), (20, 0.5)]
 
