@@ -595,17 +595,14 @@ def learn(make_env, config, *, run_dir=None, resume=False, mirror=None, meta=Non
             Gymnasium env with Box spaces. What the env gets is clipped to its action space, and the
             policy's mean lies in (-1, 1): other bounds need gymnasium.wrappers.RescaleAction.
         run_dir: folder of the run's files; None: no files. resume: go on from its checkpoint.
-        mirror: see `update`. episode_keys: of an episode's last info, to average; see Collector.
-        meta: plain dict kept in the checkpoint; a resumed run's must be equal.
+        mirror: see `update`. episode_keys: see Collector. meta: plain dict kept in the checkpoint.
         on_update: called on rank 0 after every update as on_update(model, row of progress.csv).
-        stage_end: function of the steps so far to those at which `learn` returns before the end: it
-            is to be called again, to resume, with new envs.
+        stage_end: function of the steps so far to those at which to return before the end.
 
     At each checkpoint all envs are reset, and random numbers start afresh from (seed, update,
-    rank). So going on from a checkpoint gives the same parameters, to the last bit, as never having
-    stopped (with as many ranks, and envs that reset(seed) defines). The first Ctrl-C stops after
-    the running update, with a checkpoint, by KeyboardInterrupt; a second one aborts. Also raises
-    FloatingPointError (see iterate), and what RunFolder, Collector and ActorCritic raise.
+    rank): a run that was stopped goes on to the last bit as one that was not (with as many ranks).
+    Ctrl-C stops after the running update, with a checkpoint, by KeyboardInterrupt; a second one
+    aborts. Also raises what iterate, RunFolder, Collector and ActorCritic raise.
     """
     torch.set_num_threads(1)  # more threads only cost time on nets this small
     rank, world = join_ranks()
@@ -635,16 +632,15 @@ def learn(make_env, config, *, run_dir=None, resume=False, mirror=None, meta=Non
             row = {"update": len(history) + 1, "steps": steps, "minutes": minutes,
                    **collector.averages(), **stats}
             history.append(row)
-            # The first update has a checkpoint, too: from then on a run can be resumed.
-            fresh = len(history) % config.checkpoint_every == 0 or len(history) == 1
-            fresh = fresh or stopped or steps >= end
+            fresh = (len(history) == 1 or len(history) % config.checkpoint_every == 0 or stopped
+                     or steps >= end)
             bar.update(seen)
             bar.set_postfix({name: f"{row[name]:.3g}" for name in shown})
             episodes = gather_from_ranks(list(collector.episodes)) if fresh else []
             if run:
                 run.log(history)
-            if run and fresh:
-                run.save(model, optimiser, history, episodes)
+                if fresh:
+                    run.save(model, optimiser, history, episodes)
             if on_update and rank == 0:
                 on_update(model, row)
     if stopped or interrupted:
