@@ -2,8 +2,8 @@
 
 Read it from top to bottom: the settings, the networks, two pure functions that hold the theory
 (`compute_gae`, `ppo_loss`), `Collector`, which gathers experience, `update`, which learns from it,
-and `learn`, the loop around them. It runs in one process or in many ("ranks"), which torchrun
-starts, on one machine or several.
+and `learn`, the loop around them. It runs in one process or in many ("ranks"), which `loco_mtrl.py`
+or torchrun starts, on one machine or several.
 
 Shapes: T = num_steps, N = environments of one rank, B = any batch.
 """
