@@ -110,6 +110,9 @@ STATIC_GROUP = 2  # Bullet's collision group of bodies without mass: terrain and
 # m, where no terrain is, whatever its heights: for the robot, and for people who are not needed.
 AWAY, PARKED = (-1000.0, 0.0, 0.0), (-2000.0, 0.0, 0.0)
 PICTURE = 400, 300  # pixels, width and height of a rendered frame
+SQUARE = 0.5  # m, of the chequers on the ground
+PAINT = {"chassis": (0.95, 0.75, 0.15), "hip": (0.9, 0.35, 0.15), "upper": (0.25, 0.45, 0.8),
+         "lower": (0.9, 0.9, 0.92), "toe": (0.2, 0.2, 0.2)}  # of a link, by a part of its name
 
 
 # Collision shapes in place of the convex hulls, with which most of a step would be spent on hull
@@ -148,6 +151,16 @@ def robot_urdf(visual):
     return ET.tostring(tree.getroot(), encoding="unicode")
 
 
+def load_chequers(bullet):
+    """The number of a texture of 2 x 2 light and dark squares."""
+    dark = np.kron([[1, 0], [0, 1]], np.ones((32, 32)))
+    pixels = np.where(dark, 200, 255).astype(np.uint8).repeat(3)
+    with tempfile.NamedTemporaryFile(suffix=".tga") as file:
+        file.write(bytes([0, 0, 2, *[0] * 9, 64, 0, 64, 0, 24, 0]) + pixels.tobytes())
+        file.flush()
+        return bullet.loadTexture(file.name)
+
+
 def _about_z(yaw):
     """Quaternion of a turn by `yaw` (rad) about the z axis."""
     return 0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2)
@@ -178,6 +191,7 @@ class Simulation:
             self.bullet = p = BulletClient(connection_mode=mode)
             p.configureDebugVisualizer(p.COV_ENABLE_GUI, 0)
         p.setGravity(0, 0, -9.81)
+        self.chequers = load_chequers(p) if self.visual else None
         p.setPhysicsEngineParameter(
             fixedTimeStep=DT, numSubSteps=SUBSTEPS, numSolverIterations=SOLVER_ITERATIONS,
             enableConeFriction=0, deterministicOverlappingPairs=1)
@@ -209,6 +223,11 @@ class Simulation:
         joints = [p.getJointInfo(self.robot, j) for j in range(p.getNumJoints(self.robot))]
         ids = {joint[1].decode(): joint[0] for joint in joints}
         self.joints = [ids[f"{leg}_{joint}"] for leg in LEGS for joint in JOINTS]
+        if self.visual:
+            links = {-1: "chassis"} | {joint[0]: joint[12].decode() for joint in joints}
+            for index, name in links.items():
+                colour = next(rgb for part, rgb in PAINT.items() if part in name)
+                p.changeVisualShape(self.robot, index, rgbaColor=(*colour, 1), textureUniqueId=-1)
 
     def _add_terrain(self, terrain, origin):
         p = self.bullet
@@ -222,11 +241,15 @@ class Simulation:
         a, b, c = (terrain.vertices[terrain.triangles[:, k]] for k in range(3))
         normal = np.cross(b - a, c - a)
         steep = np.abs(normal[:, 2]) < 0.5 * np.linalg.norm(normal, axis=1)
-        for part, colour in ((~steep, (0.75, 0.78, 0.66, 1)), (steep, (0.6, 0.47, 0.4, 1))):
+        x, y, z = terrain.vertices.T
+        for part, colour, squares in ((~steep, (0.75, 0.78, 0.66, 1), (x, y)),
+                                      (steep, (0.6, 0.47, 0.4, 1), (x + y, z))):
             if part.any():
                 mesh["indices"] = terrain.triangles[part].ravel().tolist()
-                looks = p.createVisualShape(p.GEOM_MESH, rgbaColor=colour, **mesh)
-                p.createMultiBody(0, -1, looks, basePosition=origin)
+                mesh["uvs"] = (np.stack(squares, 1) / (2 * SQUARE) + 1000).tolist()  # none negative
+                looks = p.createVisualShape(p.GEOM_MESH, **mesh)
+                body = p.createMultiBody(0, -1, looks, basePosition=origin)
+                p.changeVisualShape(body, -1, rgbaColor=colour, textureUniqueId=self.chequers)
 
     def _add_body(self, kind, colour, radius, height=0.0):
         """A person or, without a height, a mark that nothing feels; at first far away."""
@@ -285,12 +308,13 @@ class Simulation:
         return any(self.bullet.getContactPoints(self.robot, body) for body in self.people)
 
     def picture(self, position, yaw):
-        """The robot from above and behind, uint8 (300, 400, 3)."""
+        """The robot from above, behind and aside, uint8 (300, 400, 3)."""
         p, (width, height) = self.bullet, PICTURE
-        view = p.computeViewMatrixFromYawPitchRoll(position, 2.4, math.degrees(yaw) - 90, -52, 0, 2)
+        view = p.computeViewMatrixFromYawPitchRoll(position, 2.2, math.degrees(yaw) - 60, -42, 0, 2)
         projection = p.computeProjectionMatrixFOV(55, width / height, 0.1, 40)
-        rgba = p.getCameraImage(width, height, view, projection, lightDirection=(2, 3, 8),
-                                renderer=p.ER_TINY_RENDERER)[2]
+        rgba = p.getCameraImage(
+            width, height, view, projection, lightDirection=(2, 3, 8), lightAmbientCoeff=0.65,
+            lightDiffuseCoeff=0.5, lightSpecularCoeff=0.05, renderer=p.ER_TINY_RENDERER)[2]
         return np.reshape(rgba, (height, width, 4))[..., :3].astype(np.uint8)
 
 

@@ -515,5 +515,8 @@ def test_pictures_show_the_robot(flat):
         env.reset(seed=0)
         frame = env.render()
         assert frame.shape == (300, 400, 3) and frame.dtype == np.uint8
-        rows, columns = np.nonzero(frame.max(-1) < 60)  # the one dark thing there
+        red, green, blue = frame.astype(int).transpose(2, 0, 1)
+        rows, columns = np.nonzero((red - blue > 100) & (green - blue > 50))  # the yellow chassis
         assert rows.size > 500 and np.abs([rows.mean() - 150, columns.mean() - 200]).max() < 60
+        rows, columns = np.nonzero(blue - red > 50)  # the blue thighs
+        assert rows.size > 300 and np.abs([rows.mean() - 150, columns.mean() - 200]).max() < 60
