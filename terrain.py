@@ -378,10 +378,6 @@ def slopes(rng, difficulty):
     return rng.choice([-1, 1]) * np.interp(u, [a - up, a, b, b + down], [0, top, top, 0])
 
 
-# m: steps so low that feet slip on 30 degrees, as on smooth slopes of 20, until they crouch.
-slopes.cell = L / 8
-
-
 def ridges(rng, difficulty):
     """Up to 10 ridges, 1-4 m wide and up to 1 m high, with flanks of up to 50 degrees."""
     x, y, _ = _grid(ridges.cell)
@@ -394,10 +390,6 @@ def ridges(rng, difficulty):
     return h
 
 
-ridges.cell = L / 8
-ridges.climb = 0.06  # m: the way leads round flanks steeper than 31 degrees
-
-
 def hills(rng, difficulty):
     """Twelve round hills and hollows, 1.5-3.5 m across, with flanks of up to 38 degrees each."""
     x, y, u = _grid(hills.cell)
@@ -408,9 +400,6 @@ def hills(rng, difficulty):
         bump = 0.64 * radius * np.cos(np.pi / 2 * far.clip(0, 1)) ** 2  # steepest: 1
         h += rng.choice([-1, 1]) * rng.uniform(0.5, 1) * steep * bump
     return h * np.clip(np.minimum(u, SPAN - u) / 1.2, 0, 1)
-
-
-hills.cell = L / 2  # m: steps so low that slopes feel, and look to the LiDAR, nearly smooth
 
 
 def pyramids(rng, difficulty):
@@ -484,7 +473,11 @@ def poles(rng, difficulty):
     return np.where(pole, rng.uniform(0.4, 1.2, x.shape), 0.0)
 
 
+# m: steps so low that feet slip on 30 degrees, as on smooth slopes of 20, until they crouch.
+slopes.cell = ridges.cell = L / 8
+hills.cell = L / 2  # m: steps so low that slopes feel, and look to the LiDAR, nearly smooth
 poles.cell = L / 3
+ridges.climb = 0.06  # m: the way leads round flanks steeper than 31 degrees
 for _task in (obstacles, poles, corridors, walls, screens, traps):
     _task.fence = True  # walls all around: exploring along a wall must not lead off the border
 
