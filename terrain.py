@@ -34,12 +34,14 @@ DRAWS, TRIES = 60, 10  # of a layout, and of a start in it, before it is said to
 class Person:
     """A human who walks to and fro along `path` (P, 2), m, and stops when the robot is in the way.
 
-    speed: m/s. along: m, where on the path the walk begins.
+    speed: m/s. along: m, how far along the path the person is. waited: s, for the robot.
     """
 
     path: np.ndarray
     speed: float
     along: float = 0.0
+    direction: int = 1  # or -1, on the way back
+    waited: float = 0.0
 
     RADIUS, HEIGHT = 0.25, 1.7  # m, of the body
     CLEARANCE = 1.1  # m from the middle of the robot: half a metre between the two bodies
@@ -47,15 +49,11 @@ class Person:
 
     def __post_init__(self):
         self.mileage = np.r_[0.0, np.cumsum(np.hypot(*np.diff(self.path, axis=0).T))]  # (P,)
-        self.reset()
-
-    def reset(self):
-        self.at, self.direction, self.waited = self.along, 1, 0.0
 
     def place(self):
         """(x, y, yaw) at this moment."""
-        x, y = (float(np.interp(self.at, self.mileage, self.path[:, k])) for k in (0, 1))
-        leg = int(np.searchsorted(self.mileage[1:-1], self.at, side="right"))
+        x, y = (float(np.interp(self.along, self.mileage, self.path[:, k])) for k in (0, 1))
+        leg = int(np.searchsorted(self.mileage[1:-1], self.along, side="right"))
         dx, dy = (self.path[leg + 1] - self.path[leg]) * self.direction
         return x, y, float(np.arctan2(dy, dx))
 
@@ -69,9 +67,9 @@ class Person:
                 self.direction, self.waited = -self.direction, 0.0
             return
         self.waited = 0.0
-        self.at += self.direction * self.speed * dt
-        if not 0 <= self.at <= self.mileage[-1]:  # an end of the path
-            self.at = float(np.clip(self.at, 0, self.mileage[-1]))
+        self.along += self.direction * self.speed * dt
+        if not 0 <= self.along <= self.mileage[-1]:  # an end of the path
+            self.along = float(np.clip(self.along, 0, self.mileage[-1]))
             self.direction = -self.direction
 
 

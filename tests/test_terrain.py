@@ -543,8 +543,6 @@ def test_a_person_walks_to_and_fro_at_his_speed():
     assert (np.minimum(abs(y), abs(x - 2)) < 1e-9).all()  # never off his path
     steps = np.hypot(np.diff(x), np.diff(y))
     assert np.median(steps) == pytest.approx(0.05) and steps.max() < 0.05 + 1e-9
-    person.reset()
-    assert person.place() == pytest.approx((0.25, 0, 0))
 
 
 def test_a_person_waits_for_a_robot_ahead_and_turns_back():
