@@ -109,25 +109,14 @@ def join(meshes):
     return np.concatenate([v for v, _ in meshes]), np.concatenate(triangles).astype(np.int32)
 
 
-def _quads(*corners):
-    """Mesh of Q quads; each of the four corners is three arrays x, y, z, counter-clockwise."""
-    flat = np.broadcast_arrays(*(axis for corner in corners for axis in corner))  # 12 of (Q,)
-    vertices = np.stack(flat, -1).reshape(-1, 3).astype(float)
-    first = 4 * np.arange(len(vertices) // 4)[:, None]
-    return vertices, np.concatenate([first + [0, 1, 2], first + [0, 2, 3]], 1).reshape(-1, 3)
-
-
-def _runs(*layers):
-    """Where rows of all layers (m, n) stay as they are: row, first, last (exclusive), their values.
-
-    Of two layers only those runs count in which they differ.
-    """
-    change = np.any([np.diff(layer, axis=1, prepend=np.nan) != 0 for layer in layers], 0)
-    row, first = np.nonzero(change)
-    last = np.where(np.roll(first, -1) > 0, np.roll(first, -1), change.shape[1])
-    values = [layer[row, first] for layer in layers]
-    kept = values[0] != values[-1] if len(layers) > 1 else np.full(len(row), True)
-    return row[kept], first[kept], last[kept], [value[kept] for value in values]
+def _runs(a, b):
+    """Where rows of a and b (m, n) keep unequal values: row, first, last (exclusive), values."""
+    change = np.any([np.diff(side, axis=1, prepend=np.nan) != 0 for side in (a, b)], 0)
+    begin = np.flatnonzero(change)  # every row begins one
+    row, first = np.divmod(begin, a.shape[1])
+    last = first + np.diff(begin, append=a.size)
+    z0, z1 = a.ravel()[begin], b.ravel()[begin]
+    return (part[z0 != z1] for part in (row, first, last, z0, z1))
 
 
 def fuse_pillars(heights, cell):
@@ -141,17 +130,19 @@ def fuse_pillars(heights, cell):
     Returns vertices (V, 3) m and triangles (F, 3), counter-clockwise from outside.
     """
     middle = heights.shape[1] / 2
-    i, first, last, (z,) = _runs(heights)
+    i, first, last, z, _ = _runs(heights, heights - 1)  # every pillar has a top
     x0, x1, y0, y1 = i * cell, (i + 1) * cell, (first - middle) * cell, (last - middle) * cell
-    tops = _quads((x0, y0, z), (x1, y0, z), (x1, y1, z), (x0, y1, z))
+    tops = (x0, y0, z), (x1, y0, z), (x1, y1, z), (x0, y1, z)
     # The corners turn round with the sign of z0 - z1: each wall faces its lower side by itself.
-    i, first, last, (z0, z1) = _runs(heights[:-1], heights[1:])
+    i, first, last, z0, z1 = _runs(heights[:-1], heights[1:])
     x, y0, y1 = (i + 1) * cell, (first - middle) * cell, (last - middle) * cell
-    across = _quads((x, y0, z1), (x, y1, z1), (x, y1, z0), (x, y0, z0))
-    j, first, last, (z0, z1) = _runs(heights[:, :-1].T, heights[:, 1:].T)
+    across = (x, y0, z1), (x, y1, z1), (x, y1, z0), (x, y0, z0)
+    j, first, last, z0, z1 = _runs(heights[:, :-1].T, heights[:, 1:].T)
     x0, x1, y = first * cell, last * cell, (j + 1 - middle) * cell
-    along = _quads((x0, y, z0), (x1, y, z0), (x1, y, z1), (x0, y, z1))
-    return join([tops, across, along])
+    along = (x0, y, z0), (x1, y, z0), (x1, y, z1), (x0, y, z1)
+    vertices = np.concatenate([tops, across, along], 2).transpose(2, 0, 1).reshape(-1, 3)
+    first = 4 * np.arange(len(vertices) // 4)[:, None]
+    return vertices, (first + [0, 1, 2, 0, 2, 3]).reshape(-1, 3).astype(np.int32)
 
 
 def check_size(name, vertices, triangles):
