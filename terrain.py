@@ -177,9 +177,9 @@ def prism(polygon, bottom, top):
 
 def _window(a, radius, pick):
     """`pick` (np.max or np.min) over the square of +-`radius` cells around each cell."""
-    for axis in (0, 1):
-        padded = np.pad(a, [(radius, radius) if k == axis else (0, 0) for k in (0, 1)], "edge")
-        a = pick(np.lib.stride_tricks.sliding_window_view(padded, 2 * radius + 1, axis), axis=-1)
+    for _ in range(2):  # along x, and turned, along y
+        padded = np.pad(a, [(radius, radius), (0, 0)], "edge")
+        a = pick(np.lib.stride_tricks.sliding_window_view(padded, 2 * radius + 1, 0), -1).T
     return a
 
 
@@ -195,11 +195,11 @@ class Navigation:
         nx, ny = (max(round(n * cell / CELL), 3) for n in heights.shape)
         i, j = np.indices((nx, ny))
         self.x, self.y = (i + 0.5) * CELL, (j + 0.5 - ny / 2) * CELL
-        # Of several pillars in a cell the highest counts: the middle alone would miss thin ones.
-        parts = (np.arange(k := int(np.ceil(CELL / cell))) + 0.5) / k
-        at = [[np.minimum(((index + part) * CELL / cell).astype(int), n - 1) for part in parts]
-              for index, n in zip((i, j), heights.shape, strict=True)]
-        self.z = z = np.max([heights[a, b] for a in at[0] for b in at[1]], 0)
+        # Of k x k places in a cell the highest counts: its middle alone would miss thin pillars.
+        k = int(np.ceil(CELL / cell))
+        rows, columns = (((np.arange(k * n) + 0.5) / k * CELL / cell).astype(int) for n in (nx, ny))
+        fine = heights.take(rows, 0, mode="clip").take(columns, 1, mode="clip")
+        self.z = z = fine.reshape(nx, k, ny, k).max((1, 3))
         filled = _window(_window(z, 1, np.max), 1, np.min)
         self.solid = z > filled - 0.02
         edge = np.ones(z.shape, bool)
