@@ -528,12 +528,10 @@ def _interpolate(nodes, x, y):
     """Values (X, Y) of a grid of nodes at places x, y (1-D, in nodes) between them, eased."""
     weights = []
     for at, n in ((x, nodes.shape[0]), (y, nodes.shape[1])):
-        low = np.clip(np.floor(at).astype(int), 0, n - 2)
-        part = np.clip(at - low, 0, 1)
-        weight = np.zeros((len(at), n))
-        weight[np.arange(len(at)), low + 1] = ease = part * part * (3 - 2 * part)
-        weight[np.arange(len(at)), low] = 1 - ease
-        weights.append(weight)
+        low = np.minimum(at.astype(int), n - 2)
+        part = (at - low)[:, None]
+        ease = part * part * (3 - 2 * part)
+        weights.append(np.eye(n)[low] * (1 - ease) + np.eye(n)[low + 1] * ease)
     return weights[0] @ nodes @ weights[1].T
 
 
@@ -547,18 +545,18 @@ def _fractal(rng, size, coarse, octaves, degrees):
     h, x, y = np.zeros((m, n)), np.arange(m) * CELL, np.arange(n) * CELL
     for k in range(octaves):
         fine = coarse / 2**k
-        values = rng.uniform(-1, 1, (int(x[-1] / fine) + 2, int(y[-1] / fine) + 2))
-        h += _interpolate(values, x / fine, y / fine) / 2.6**k
+        nodes = rng.uniform(-1, 1, (int(x[-1] / fine) + 2, int(y[-1] / fine) + 2))
+        h += _interpolate(nodes, x / fine, y / fine) / 2.6**k
     h *= np.tan(np.radians(degrees)) / np.percentile(np.hypot(*np.gradient(h, CELL)), 95)
     i, j = rng.integers(15, 26), rng.integers(20, n - 20)
     far = np.hypot(*np.meshgrid(x - x[i], y - y[j], indexing="ij"))
     return h[i, j] + (h - h[i, j]) * np.clip((far - 0.9) / 1.2, 0, 1)
 
 
-def _surface(corners, every):
-    """Heights of CELLs, and the mesh through every so many-th of their corners."""
+def _surface(corners):
+    """(plan, meshes) of ground through the corners of CELLs, (m + 1, n + 1) m, in 0.2 m squares."""
     plan = (corners[1:, 1:] + corners[:-1, :-1]) / 2
-    return plan, triangulate(corners[::every, ::every], every * CELL)
+    return plan, [triangulate(corners[::2, ::2], 2 * CELL)]
 
 
 def _put(plan, polygon, bottom, top):
@@ -594,8 +592,7 @@ def mountain(rng, faces, degrees):
 
     faces: how many rock faces, 1-3 m long and 0.5-1 m tall, stand there to be walked around.
     """
-    plan, mesh = _surface(_fractal(rng, (14.0, 10.0), 5.0, 4, degrees), 2)
-    meshes = [mesh]
+    plan, meshes = _surface(_fractal(rng, (14.0, 10.0), 5.0, 4, degrees))
     for k in range(int(faces) + 20):
         long = rng.uniform(1, 3) if k < faces else rng.uniform(0.2, 0.5)
         tall = rng.uniform(0.5, 1.0) if k < faces else rng.uniform(0.1, 0.4)
@@ -612,8 +609,8 @@ def forest(rng, trunks):
     """Ground with bumps of 0.1 m and so many trunks, 0.16-0.4 m thick: 12 x 10 m."""
     bumps = rng.uniform(-0.07, 0.07, (25, 21))
     corners = _interpolate(bumps, np.arange(121) / 5, np.arange(101) / 5)
-    plan, mesh = _surface(corners, 2)
-    meshes, turn = [mesh], 2 * np.pi * np.arange(9)[:, None] / 9
+    plan, meshes = _surface(corners)
+    turn = 2 * np.pi * np.arange(9)[:, None] / 9
     for _ in range(int(trunks)):
         radius, middle = rng.uniform(0.08, 0.2), rng.uniform((0.3, -4.7), (11.7, 4.7))
         polygon = middle + radius * np.hstack([np.cos(turn), np.sin(turn)])
@@ -642,8 +639,7 @@ def cliff(rng, swing):
 
 def continuous(rng, degrees):
     """A smooth random surface of triangles, 5 % of it steeper than `degrees`: 13 x 10 m."""
-    plan, mesh = _surface(_fractal(rng, (13.0, 10.0), 3.0, 2, degrees), 2)
-    return plan, [mesh]
+    return _surface(_fractal(rng, (13.0, 10.0), 3.0, 2, degrees))
 
 
 def _doorway(rng, wall):
