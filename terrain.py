@@ -778,8 +778,14 @@ MAX_SIZE = 1000.0  # m, of a scan: more is a mistake in its scale
 
 def read_scan(path, scale, up):
     """The part of a scan within WINDOW of its middle, a trimesh, z up; see load_scan."""
-    import trimesh
-
+    if not 0 < scale < np.inf or up not in ("y", "z"):
+        raise ValueError(f"scale must be above 0 and finite, and up 'y' or 'z': {scale}, {up!r}")
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"there is no scan at {path}")
+    try:
+        import trimesh
+    except ImportError:
+        raise ImportError("scans need trimesh: pip install 'loco-mtrl[scans]'") from None
     try:
         file, kind = str(path), Path(path).suffix[1:].lower()
         if kind == "obj":  # trimesh takes no remark behind a face, and every face to be convex
@@ -798,9 +804,8 @@ def read_scan(path, scale, up):
     corners = corners[((low < WINDOW) & (high > -WINDOW))[:, :2].all(1)]
     if np.ptp(corners, (0, 1)).max() > MAX_SIZE:
         raise ValueError(f"{path} is more than {MAX_SIZE:.0f} m wide: is scale {scale} right?")
-    parts = trimesh.remesh.subdivide_to_size(*trimesh.triangles.to_kwargs(corners).values(), 2.0,
-                                             max_iter=20)
-    mesh = trimesh.Trimesh(*parts)
+    whole = trimesh.Trimesh(**trimesh.triangles.to_kwargs(corners))
+    mesh = whole.subdivide_to_size(2.0, max_iter=20)
     mesh.update_faces((np.abs(mesh.triangles_center[:, :2]) < WINDOW).all(1))
     mesh.remove_unreferenced_vertices()
     check_size(path, mesh.vertices, mesh.faces)
@@ -820,16 +825,8 @@ def load_scan(path, scale=1.0, up="z"):
     Raises ImportError without trimesh, FileNotFoundError, or ValueError for a bad scale or axis, a
     file that is no mesh, more triangles than PyBullet takes, and a scan without a floor.
     """
-    if not 0 < scale < np.inf or up not in ("y", "z"):
-        raise ValueError(f"scale must be above 0 and finite, and up 'y' or 'z': {scale}, {up!r}")
-    if not Path(path).is_file():
-        raise FileNotFoundError(f"there is no scan at {path}")
-    try:
-        import trimesh
-    except ImportError:
-        raise ImportError("scans need trimesh: pip install 'loco-mtrl[scans]'") from None
     mesh = read_scan(path, scale, up)
-    points, _ = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, CELL, max_iter=20)
+    points = mesh.subdivide_to_size(CELL, max_iter=20).vertices
     low = points.min(0) - (0, 0, CELL)
     i, j, k = np.floor((points - low) / CELL).astype(int).T
     voxels = np.zeros((i.max() + 1, j.max() + 1, k.max() + HEADROOM + 3), bool)
@@ -837,9 +834,10 @@ def load_scan(path, scale=1.0, up="z"):
     window = np.lib.stride_tricks.sliding_window_view(voxels, HEADROOM + 2, 2)  # from k on
     floor = window[..., 0] & ~window[..., 1:].any(-1)
     ceiling = np.cumsum(voxels[..., ::-1], 2)[..., ::-1][..., HEADROOM + 1 :] > 0
-    covered = floor & ceiling
-    floor = covered if covered.sum() > 0.2 * floor.sum() else floor
-    for level in np.argsort(-floor.sum((0, 1)), kind="stable")[: min(3, floor.any((0, 1)).sum())]:
+    if (floor & ceiling).sum() > 0.2 * floor.sum():
+        floor &= ceiling
+    area = floor.sum((0, 1))  # of each level, in voxels
+    for level in np.argsort(-area, kind="stable")[: min(3, (area > 0).sum())]:
         plan, at = np.full(voxels.shape[:2], -100.0), (k >= level - 1) & (k <= level + 1)
         zero = np.median(points[k == level, 2])
         np.maximum.at(plan, (i[at], j[at]), points[at, 2] - zero)
