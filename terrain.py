@@ -112,7 +112,7 @@ def join(meshes):
 def _runs(a, b):
     """Where rows of a and b (m, n) keep unequal values: row, first, last (exclusive), values."""
     change = np.any([np.diff(side, axis=1, prepend=np.nan) != 0 for side in (a, b)], 0)
-    begin = np.flatnonzero(change)  # every row begins one
+    begin = np.flatnonzero(change)  # every row begins a run
     row, first = np.divmod(begin, a.shape[1])
     last = first + np.diff(begin, append=a.size)
     z0, z1 = a.ravel()[begin], b.ravel()[begin]
@@ -157,9 +157,8 @@ def triangulate(nodes, cell):
     i, j = np.indices(nodes.shape)
     n = nodes.shape[1]
     vertices = np.stack([i * cell, (j - (n - 1) / 2) * cell, nodes], -1).reshape(-1, 3)
-    a = (i * n + j)[:-1, :-1].ravel()  # each square's corner at the least x and y
-    lower, upper = np.stack([a, a + n, a + n + 1], 1), np.stack([a, a + n + 1, a + 1], 1)
-    return vertices, np.concatenate([lower, upper])
+    corner = (i * n + j)[:-1, :-1].reshape(-1, 1)  # of each square, at the least x and y
+    return vertices, np.concatenate([corner + [0, n, n + 1], corner + [0, n + 1, 1]])
 
 
 def prism(polygon, bottom, top):
@@ -482,8 +481,8 @@ def make_terrain(task, rng, difficulty):
     finished Terrain, which is returned as it is. rng: numpy Generator; difficulty: in [0, 1].
     A function may have attributes: `cell`, m, the pillars' cross-section if it is not L; `climb`,
     m, the highest step on a way if it is not STEP; `fence`, walls along the border.
-    Raises ValueError for an unknown task, a difficulty outside [0, 1], heights that are not a
-    finite 2-D array or too many for PyBullet, and a task that yields no route in DRAWS draws.
+    Raises ValueError for an unknown task, a difficulty outside [0, 1], a bad cell or climb, heights
+    not finite, not 2-D or too many for PyBullet, and a task without a route in DRAWS draws.
     """
     if isinstance(task, Terrain):
         return task
@@ -500,8 +499,7 @@ def make_terrain(task, rng, difficulty):
     for _ in range(DRAWS):
         heights = np.array(generate(rng, difficulty), float)
         if heights.ndim != 2 or not heights.size or not np.isfinite(heights).all():
-            raise ValueError(f"task {name!r}: heights must be a finite 2-D array, got shape "
-                             f"{heights.shape}")
+            raise ValueError(f"task {name!r}: heights must be finite and 2-D, got {heights.shape}")
         pad = round(PAD * L / cell)
         for strip in (heights[:pad], heights[-pad:]):  # level, for episodes to start there
             strip[:] = np.median(strip)
@@ -593,7 +591,7 @@ def mountain(rng, faces, degrees):
     faces: how many rock faces, 1-3 m long and 0.5-1 m tall, stand there to be walked around.
     """
     plan, meshes = _surface(_fractal(rng, (14.0, 10.0), 5.0, 4, degrees))
-    for k in range(int(faces) + 20):
+    for k in range(faces + 20):
         long = rng.uniform(1, 3) if k < faces else rng.uniform(0.2, 0.5)
         tall = rng.uniform(0.5, 1.0) if k < faces else rng.uniform(0.1, 0.4)
         middle, turn = rng.uniform((3.3, -4.5), (13.5, 4.5)), rng.uniform(0, np.pi)
@@ -611,7 +609,7 @@ def forest(rng, trunks):
     corners = _interpolate(bumps, np.arange(121) / 5, np.arange(101) / 5)
     plan, meshes = _surface(corners)
     turn = 2 * np.pi * np.arange(9)[:, None] / 9
-    for _ in range(int(trunks)):
+    for _ in range(trunks):
         radius, middle = rng.uniform(0.08, 0.2), rng.uniform((0.3, -4.7), (11.7, 4.7))
         polygon = middle + radius * np.hstack([np.cos(turn), np.sin(turn)])
         meshes.append(_put(plan, polygon, -0.2, 2.0))
@@ -656,7 +654,7 @@ def _furnish(rng, plan, furniture):
     LiDAR looks through below them.
     """
     meshes = [fuse_pillars(plan, CELL)]
-    for _ in range(int(furniture)):
+    for _ in range(furniture):
         a, b, tall = [(4, 8, 1.8), (7, 14, 0.75), (4, 4, 0.45)][rng.integers(3)]
         a, b = (a, b) if rng.random() < 0.5 else (b, a)
         i, j = rng.integers(2, plan.shape[0] - a - 1), rng.integers(2, plan.shape[1] - b - 1)
