@@ -122,9 +122,8 @@ def _runs(a, b):
 def fuse_pillars(heights, cell):
     """Mesh of m x n pillars without the faces that cannot be seen (section 2.3).
 
-    One mesh is simulated and scanned many times faster than 2,400 boxes. Equal neighbours
-    along y share one top. Walls stand only between unequal ones, and grow into one where they are
-    alike. The outer border is open.
+    One mesh is simulated and scanned many times faster than 2,400 boxes. Equal neighbours along y
+    share a top, equal steps along an edge share a wall. The outer border is open.
 
     heights: (m, n) m. cell: m, the pillars' cross-section.
     Returns vertices (V, 3) m and triangles (F, 3), counter-clockwise from outside.
