@@ -589,7 +589,7 @@ def make_env(tasks, seconds=30, **options):
 REWARD_SCALE = HOLD * DT  # rewards in metres of progress keep the critic's targets near 1
 LAYOUTS = 8  # terrains of each training environment
 PROGRAM = "python loco_mtrl.py"
-STAGE = 400_000  # steps; then every process starts itself afresh, on new layouts
+STAGE = 250_000  # steps; then every process starts itself afresh, on new layouts
 
 
 def stage(steps, args):

@@ -236,7 +236,7 @@ class Navigation:
         path = [cell]
         while 0 < far[cell] < np.inf:
             i, j = cell
-            around = [(i + a, j + b) for a in (0, -1, 1) for b in (0, -1, 1)]  # straight first
+            around = [(i + a, j + b) for a in (0, -1, 1) for b in (0, -1, 1)]
             cell = min(around, key=far.__getitem__)
             path.append(cell)
         return np.array([(self.x[c], self.y[c]) for c in path]) if far[cell] == 0 else None
@@ -768,7 +768,7 @@ def _person(rng, nav, start):
 
 # ---------------------------------------------------------------- scanned buildings
 
-HEADROOM = 7  # CELLs, least clearance over a floor
+HEADROOM = 8  # CELLs, least clearance over a floor
 WINDOW = 20.0  # m, from the middle of a scan in x and y to where the rest is cut off
 MAX_SIZE = 1000.0  # m, of a scan: more is a mistake in its scale
 
@@ -799,6 +799,8 @@ def read_scan(path, scale, up):
     corners -= np.median(corners.reshape(-1, 3), 0)  # a stray triangle far away moves no median
     low, high = corners.min(1), corners.max(1)
     corners = corners[((low < WINDOW) & (high > -WINDOW))[:, :2].all(1)]
+    if not len(corners):
+        raise ValueError(f"{path} has nothing within {WINDOW:.0f} m of its middle")
     if np.ptp(corners, (0, 1)).max() > MAX_SIZE:
         raise ValueError(f"{path} is more than {MAX_SIZE:.0f} m wide: is scale {scale} right?")
     whole = trimesh.Trimesh(**trimesh.triangles.to_kwargs(corners))
@@ -826,11 +828,11 @@ def load_scan(path, scale=1.0, up="z"):
     points = mesh.subdivide_to_size(CELL, max_iter=20).vertices
     low = points.min(0) - (0, 0, CELL)
     i, j, k = np.floor((points - low) / CELL).astype(int).T
-    voxels = np.zeros((i.max() + 1, j.max() + 1, k.max() + HEADROOM + 3), bool)
+    voxels = np.zeros((i.max() + 1, j.max() + 1, k.max() + HEADROOM + 2), bool)
     voxels[i, j, k] = True
-    window = np.lib.stride_tricks.sliding_window_view(voxels, HEADROOM + 2, 2)  # from k on
+    window = np.lib.stride_tricks.sliding_window_view(voxels, HEADROOM + 1, 2)  # from k on
     floor = window[..., 0] & ~window[..., 1:].any(-1)
-    ceiling = np.cumsum(voxels[..., ::-1], 2)[..., ::-1][..., HEADROOM + 1 :] > 0
+    ceiling = np.cumsum(voxels[..., ::-1], 2)[..., ::-1][..., HEADROOM:] > 0
     if (floor & ceiling).sum() > 0.2 * floor.sum():
         floor &= ceiling
     area = floor.sum((0, 1))  # of each level, in voxels
@@ -838,7 +840,7 @@ def load_scan(path, scale=1.0, up="z"):
         plan, at = np.full(voxels.shape[:2], -100.0), (k >= level - 1) & (k <= level + 1)
         zero = np.median(points[k == level, 2])
         np.maximum.at(plan, (i[at], j[at]), points[at, 2] - zero)
-        plan[voxels[..., level + 2 : level + 2 + HEADROOM].any(2)] = 1.0  # walls, furniture
+        plan[voxels[..., level + 2 : level + 1 + HEADROOM].any(2)] = 1.0  # walls, furniture
         nav, rng = Navigation(plan, CELL, 0.12), np.random.default_rng(0)
         for least in (8, 4, 2, 1):
             routes = find_routes(nav, rng, 1, (least, 12), floor=-1.0)

@@ -480,19 +480,19 @@ def test_each_training_environment_has_one_task_and_layouts_of_its_own(monkeypat
         {"flat"}, {"rugged"}, {"stairs"}, {"flat"}]
     first = pool(1)
     assert len(set(first)) == 2 and pool(1) == first
-    others = pool(4) + pool(1, 400_000) + pool(1, seed=1)  # index, stage, seed
+    others = pool(4) + pool(1, 250_000) + pool(1, seed=1)  # index, stage, seed
     assert {name for name, _ in others} == {"rugged"} and len(set(first + others)) == 8
     assert {name for name, _ in pool(0, 600_000, sequential=True)} == {"stairs"}
 
 
-def test_a_new_stage_begins_every_400000_steps_and_with_each_task_that_follows_another():
+def test_a_new_stage_begins_every_250000_steps_and_with_each_task_that_follows_another():
     args = SimpleNamespace(tasks=["flat", "rugged", "stairs"], steps=900_000, sequential=False)
-    stages = {0: (0, 0, 400_000), 399_999: (0, 0, 400_000), 400_000: (1, 0, 800_000),
-              800_001: (2, 0, 900_000), 900_500: (2, 0, 900_000)}
+    stages = {0: (0, 0, 250_000), 249_999: (0, 0, 250_000), 250_000: (1, 0, 500_000),
+              750_001: (3, 0, 900_000), 900_500: (3, 0, 900_000)}
     assert {steps: loco_mtrl.stage(steps, args) for steps in stages} == stages
     args.sequential = True
-    stages = {0: (0, 0, 300_000), 300_000: (0, 1, 400_000), 400_000: (1, 1, 600_000),
-              600_000: (1, 2, 800_000), 800_000: (2, 2, 900_000), 900_500: (2, 2, 900_000)}
+    stages = {0: (0, 0, 250_000), 250_000: (1, 0, 300_000), 300_000: (1, 1, 500_000),
+              600_000: (2, 2, 750_000), 750_000: (3, 2, 900_000), 900_500: (3, 2, 900_000)}
     assert {steps: loco_mtrl.stage(steps, args) for steps in stages} == stages
 
 

@@ -106,6 +106,7 @@ def in_ranks(world, function, seconds=60):
     ("total_timesteps", 0), ("num_envs", -1), ("num_steps", 0), ("update_epochs", 0),
     ("num_minibatches", 0), ("checkpoint_every", 0), ("gamma", 1.01), ("gamma", math.nan),
     ("gae_lambda", -0.1), ("clip_coef", 0), ("max_advantage", 0.0), ("max_grad_norm", math.inf),
+    ("max_disadvantage", -3.0),
     ("target_kl", (0.03, 0.0)), ("learning_rate", 0.0), ("critic_learning_rate", -1e-3),
     ("init_std", -1), ("init_std", (0.1, 0.0)), ("init_std", ()), ("noise", (1.0, math.nan)),
     ("n_scan", -1), ("hidden", ()), ("hidden", (64, 0)), ("seed", -1),
@@ -443,9 +444,10 @@ def test_ratio_is_one_on_the_first_minibatch_and_no_other(losses):
     assert len(others) == 3 and all(kl.item() > 1e-8 for *_, kl in others)
 
 
-@pytest.mark.parametrize("bound", [99.0, 1.0])
-def test_an_update_reports_and_uses_what_its_rollout_holds(bound, losses):
-    model, optimiser, config = fresh(update_epochs=1, num_minibatches=1, max_advantage=bound)
+@pytest.mark.parametrize(("low", "high"), [(99.0, 99.0), (1.0, 1.0), (1.5, 0.5)])
+def test_an_update_reports_and_uses_what_its_rollout_holds(low, high, losses):
+    model, optimiser, config = fresh(update_epochs=1, num_minibatches=1, max_advantage=high,
+                                     max_disadvantage=low)
     rollout = experience(model)
     with torch.no_grad():
         values = model.value(rollout[0])
@@ -454,7 +456,7 @@ def test_an_update_reports_and_uses_what_its_rollout_holds(bound, losses):
                     for x in compute_gae(rollout[2], values, *rollout[3:],
                                                config.gamma, config.gae_lambda))
     stats = ppo.update(model, optimiser, rollout, config, torch.Generator(), 0.03)
-    expected = ((raw - raw.mean()) / raw.std()).clip(-bound, bound)
+    expected = ((raw - raw.mean()) / raw.std()).clip(-low, high)
     expected -= expected.mean()
     assert len(raw) == 16 * 4 - 3
     np.testing.assert_allclose(losses[0][2].sort()[0], np.sort(expected), atol=1e-5)

@@ -693,6 +693,13 @@ def test_suffixes_may_be_upper_case_and_files_lie_in_pieces(tmp_path):
         np.testing.assert_allclose(np.ptp(place.vertices, 0), (8, 6, 2.5), atol=1e-3)
 
 
+def test_a_scan_with_nothing_about_its_middle_is_named(tmp_path):
+    around = [level(x, y, x + 2, y + 2, 0) for x in (0, 30, 60) for y in (0, 30, 60)
+              if (x, y) != (30, 30)]
+    with pytest.raises(ValueError, match=r"ring.obj has nothing within 20 m of its middle"):
+        load_scan(saved(tmp_path / "ring.obj", around))
+
+
 def test_a_scan_in_millimetres_is_named_and_a_wide_one_is_cut(tmp_path):
     path = saved(tmp_path / "a.obj", room(), lambda corners: 1000 * corners)
     with pytest.raises(ValueError, match="a.obj is more than 1000 m wide: is scale 1.0 right"):
