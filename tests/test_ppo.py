@@ -483,10 +483,10 @@ def test_reset_rows_teach_nothing():
 ])
 def test_step_size_follows_the_kl_and_too_large_a_step_ends_the_update(
         target_kl, learning_rate, follows, epochs, losses):
-    model, optimiser, config = fresh(learning_rate=learning_rate)
+    model, optimiser, config = fresh(learning_rate=learning_rate, update_epochs=3)
     start, rollout = states(model), experience(model)
     if target_kl is None:  # what the update will reach
-        probe, other, _ = fresh(learning_rate=learning_rate)
+        probe, other, _ = fresh(learning_rate=learning_rate, update_epochs=3)
         target_kl = ppo.update(probe, other, rollout, config, torch.Generator().manual_seed(0),
                                1.0)["approx_kl"]
         losses.clear()
