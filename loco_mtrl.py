@@ -335,43 +335,41 @@ class Part(NamedTuple):
     """Part of an observation or an action; part[image] * sign is its left-right mirror image."""
 
     name: str
-    size: int
     low: float
     high: float
     image: list
-    sign: list
-    std: float  # of an action's exploration noise at first
+    sign: int | list = 1  # one for all entries, or one for each
+    std: float = 0.0  # of an action's exploration noise at first
+
+    @property
+    def size(self):
+        return len(self.image)
 
 
-def _part(name, low, high, image, sign=1, std=0.0):
-    image = np.ravel(image).tolist()
-    return Part(name, len(image), low, high, image, (np.ones(len(image)) * sign).tolist(), std)
-
-
-SWAP_LEGS = np.arange(12).reshape(4, 3)[[1, 0, 3, 2]]  # joint angles mirror unsigned
+SWAP_RAYS = np.arange(N_RAYS).reshape(SCAN_SHAPE)[:, ::-1].ravel()
+SWAP_LEGS = np.arange(12).reshape(4, 3)[[1, 0, 3, 2]].ravel()  # joint angles mirror unsigned
 SWAP_STRIDES = [0, 2, 1, 3, 4]
 
 
 def observation_parts(tg=True, lidar=True):
     """What an observation consists of, in its order (section 2.1)."""
-    eyes = [_part("LiDAR scan, sqrt(distance / 5 m)", 0, 1,
-                  np.arange(N_RAYS).reshape(SCAN_SHAPE)[:, ::-1])]
-    body = [_part("distance to the goal, m", 0, 1e3, [0]),
-            _part("heading of the goal, left positive, rad", -math.pi, math.pi, [0], -1),
-            _part("angular rates of the base, rad/s", -1e3, 1e3, [0, 1, 2], [-1, 1, -1]),
-            _part("joint angles, rad", -1e2, 1e2, SWAP_LEGS),
-            _part("last commanded joint angles, rad", -1e2, 1e2, SWAP_LEGS)]
-    gait = [_part("TG: cosine and sine of each leg's phase", -1, 1, [1, 0, 3, 2, 5, 4, 7, 6]),
-            _part("TG: parameters in force", -1, 1, SWAP_STRIDES)]
+    eyes = [Part("LiDAR scan, sqrt(distance / 5 m)", 0, 1, SWAP_RAYS)]
+    body = [Part("distance to the goal, m", 0, 1e3, [0]),
+            Part("heading of the goal, left positive, rad", -math.pi, math.pi, [0], -1),
+            Part("angular rates of the base, rad/s", -1e3, 1e3, [0, 1, 2], [-1, 1, -1]),
+            Part("joint angles, rad", -1e2, 1e2, SWAP_LEGS),
+            Part("last commanded joint angles, rad", -1e2, 1e2, SWAP_LEGS)]
+    gait = [Part("TG: cosine and sine of each leg's phase", -1, 1, [1, 0, 3, 2, 5, 4, 7, 6]),
+            Part("TG: parameters in force", -1, 1, SWAP_STRIDES)]
     return (eyes if lidar else []) + body + (gait if tg else [])
 
 
 def action_parts(tg=True):
     """What an action consists of."""
     if not tg:
-        return [_part("joint offsets from the standing pose", -1, 1, SWAP_LEGS, std=0.25)]
-    return [_part("TG: parameters", -1, 1, SWAP_STRIDES, std=0.3),
-            _part("joint residuals", -1, 1, SWAP_LEGS, std=0.5)]
+        return [Part("joint offsets from the standing pose", -1, 1, SWAP_LEGS, std=0.25)]
+    return [Part("TG: parameters", -1, 1, SWAP_STRIDES, std=0.3),
+            Part("joint residuals", -1, 1, SWAP_LEGS, std=0.5)]
 
 
 def box(parts):
@@ -382,9 +380,11 @@ def box(parts):
 
 def mirror(parts):
     """(index, sign) over all parts: the image of an observation or action x is x[index] * sign."""
-    starts = itertools.accumulate((part.size for part in parts), initial=0)
-    index = [start + k for start, part in zip(starts, parts, strict=False) for k in part.image]
-    return index, [sign for part in parts for sign in part.sign]
+    index, sign = [], []
+    for part in parts:
+        index += [len(sign) + k for k in part.image]
+        sign += np.broadcast_to(part.sign, part.size).tolist()
+    return index, sign
 
 
 class LocoEnv(gymnasium.Env):
