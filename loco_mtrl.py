@@ -48,20 +48,14 @@ from tg import LEGS, STANDING, TrajectoryGenerator
 @contextlib.contextmanager
 def quiet():
     """PyBullet prints banners from C; they have no place in progress bars and JSON."""
-    if sys.stdout:
-        sys.stdout.flush()
-    saved, sink = {}, os.open(os.devnull, os.O_WRONLY)
-    for file in (1, 2):
-        with contextlib.suppress(OSError):  # it may be closed
-            saved[file] = os.dup(file)
-            os.dup2(sink, file)
-    try:
+    with open(os.devnull, "w") as sink, contextlib.ExitStack() as stack:
+        for file in (1, 2):
+            with contextlib.suppress(OSError):  # it may be closed
+                saved = os.dup(file)
+                stack.callback(os.close, saved)
+                stack.callback(os.dup2, saved, file)
+                os.dup2(sink.fileno(), file)
         yield
-    finally:
-        for file, copy_ in saved.items():
-            os.dup2(copy_, file)
-            os.close(copy_)
-        os.close(sink)
 
 
 with quiet():
