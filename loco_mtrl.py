@@ -94,7 +94,8 @@ def lidar_rays():
 
 # ------------------------------------------------------------------------------- the simulation
 
-LAIKAGO = Path(pybullet_data.getDataPath()) / "laikago" / "laikago_toes_zup.urdf"
+DATA = Path(pybullet_data.getDataPath())
+LAIKAGO, CHEQUERS = DATA / "laikago" / "laikago_toes_zup.urdf", DATA / "checker_blue.png"
 JOINTS = ("hip_motor_2_chassis_joint", "upper_leg_2_hip_motor_joint", "lower_leg_2_upper_leg_joint")
 SUBSTEPS, DT = 5, 1 / 30  # physics steps in a control step, and its length in s
 MAX_TORQUE = 40.0  # Nm
@@ -145,16 +146,6 @@ def robot_urdf(visual):
     return ET.tostring(tree.getroot(), encoding="unicode")
 
 
-def load_chequers(bullet):
-    """The number of a texture of 2 x 2 light and dark squares."""
-    dark = np.kron([[1, 0], [0, 1]], np.ones((32, 32)))
-    pixels = np.where(dark, 200, 255).astype(np.uint8).repeat(3)
-    with tempfile.NamedTemporaryFile(suffix=".tga") as file:
-        file.write(bytes([0, 0, 2, *[0] * 9, 64, 0, 64, 0, 24, 0]) + pixels.tobytes())
-        file.flush()
-        return bullet.loadTexture(file.name)
-
-
 def _about_z(yaw):
     """Quaternion of a turn by `yaw` (rad) about the z axis."""
     return 0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2)
@@ -185,7 +176,7 @@ class Simulation:
             self.bullet = p = BulletClient(connection_mode=mode)
             p.configureDebugVisualizer(p.COV_ENABLE_GUI, 0)
         p.setGravity(0, 0, -9.81)
-        self.chequers = load_chequers(p) if self.visual else None
+        self.chequers = p.loadTexture(str(CHEQUERS)) if self.visual else None
         p.setPhysicsEngineParameter(
             fixedTimeStep=DT, numSubSteps=SUBSTEPS, numSolverIterations=SOLVER_ITERATIONS,
             enableConeFriction=0, deterministicOverlappingPairs=1)
@@ -236,7 +227,7 @@ class Simulation:
         normal = np.cross(b - a, c - a)
         steep = np.abs(normal[:, 2]) < 0.5 * np.linalg.norm(normal, axis=1)
         x, y, z = terrain.vertices.T
-        for part, colour, squares in ((~steep, (0.75, 0.78, 0.66, 1), (x, y)),
+        for part, colour, squares in ((~steep, (0.8, 0.76, 0.6, 1), (x, y)),
                                       (steep, (0.6, 0.47, 0.4, 1), (x + y, z))):
             if part.any():
                 mesh["indices"] = terrain.triangles[part].ravel().tolist()
