@@ -908,16 +908,15 @@ def play(args):
         from PIL import Image
 
         check_writable(args.gif)
-    frames, path = [], []
+    frames, steps = [], enumerate(episode(args.policy, place, args.seed, **options))
     with tqdm(total=EVAL_SECONDS, unit="s", bar_format="{l_bar}{bar}|{n:.0f}/{total} s") as bar:
-        for env, info in episode(args.policy, place, args.seed, **options):  # noqa: B007
+        for k, (env, info) in steps:  # noqa: B007
             if args.gui:
                 env.simulation.bullet.resetDebugVisualizerCamera(
                     2.4, math.degrees(env.robot.yaw) - 90, -40, env.robot.position)
                 time.sleep(DT * HOLD)
-            elif len(path) % GIF_EVERY == 0:
+            elif k % GIF_EVERY == 0:
                 frames.append(env.render())
-            path.append(env.robot.position)
             bar.update(min(env.seconds, EVAL_SECONDS) - bar.n)
     end = "reached the goal" if info["success"] else "fell" if info["fall"] else "ran out of time"
     print(f"{info['task']}: t_cr {info['t_cr']:.2f}, {end} after {env.seconds:.1f} s")
@@ -937,11 +936,9 @@ def gallery(args):
 
     check_writable(args.out)
     names = [*PILLAR_TASKS, *WORLDS]
-    figure = Figure(figsize=(15, 11), layout="constrained")
-    axes = figure.subplots(-(-len(names) // 6), 6).ravel()
-    for axis in axes[len(names) :]:
-        axis.remove()
-    for axis, name in zip(axes, tqdm(names, unit="terrain"), strict=False):
+    figure, rows = Figure(figsize=(15, 11), layout="constrained"), math.ceil(len(names) / 6)
+    for k, name in enumerate(tqdm(names, unit="terrain")):
+        axis = figure.add_subplot(rows, 6, k + 1)
         rng, unseen = np.random.default_rng(args.seed), name in WORLDS
         draw_map(axis, make_world(name, args.seed) if unseen else make_terrain(name, rng, 0.8))
         axis.set_title(name, color="tab:red" if unseen else "k", fontsize=13)
