@@ -559,8 +559,7 @@ class LocoEnv(gymnasium.Env):
             self.simulation = self.robot = None
 
 
-if "LocoMTRL-v0" not in gymnasium.registry:  # run as a script, this file is imported once more
-    gymnasium.register("LocoMTRL-v0", "loco_mtrl:LocoEnv", max_episode_steps=300)
+gymnasium.register("LocoMTRL-v0", LocoEnv, max_episode_steps=300)
 
 
 def make_env(tasks, seconds=30, **options):
@@ -1048,6 +1047,4 @@ def main(argv=None):
 
 
 if __name__ == "__main__":
-    import loco_mtrl  # by the name that gymnasium and the worker processes know
-
-    sys.exit(loco_mtrl.main())
+    sys.exit(main())
