@@ -104,8 +104,6 @@ POSITION_GAIN, VELOCITY_GAIN, SOLVER_ITERATIONS = 0.10, 1.0, 10
 STATIC_GROUP = 2  # Bullet's collision group of bodies without mass: terrain and people
 # m, where no terrain is, whatever its heights: for the robot, and for people who are not needed.
 AWAY, PARKED = (-1000.0, 0.0, 0.0), (-2000.0, 0.0, 0.0)
-PICTURE = 400, 300  # pixels, width and height of a rendered frame
-SQUARE = 0.5  # m, of the chequers on the ground
 PAINT = {"chassis": (0.95, 0.75, 0.15), "hip": (0.9, 0.35, 0.15), "upper": (0.25, 0.45, 0.8),
          "lower": (0.9, 0.9, 0.92), "toe": (0.2, 0.2, 0.2)}  # of a link, by a part of its name
 
@@ -231,7 +229,7 @@ class Simulation:
                                       (steep, (0.6, 0.47, 0.4, 1), (x + y, z))):
             if part.any():
                 mesh["indices"] = terrain.triangles[part].ravel().tolist()
-                mesh["uvs"] = (np.stack(squares, 1) / (2 * SQUARE) + 1000).tolist()  # none negative
+                mesh["uvs"] = (np.stack(squares, 1) + 1000).tolist()  # m; none may be negative
                 looks = p.createVisualShape(p.GEOM_MESH, **mesh)
                 body = p.createMultiBody(0, -1, looks, basePosition=origin)
                 p.changeVisualShape(body, -1, rgbaColor=colour, textureUniqueId=self.chequers)
@@ -294,7 +292,7 @@ class Simulation:
 
     def picture(self, position, yaw):
         """The robot from above, behind and aside, uint8 (300, 400, 3)."""
-        p, (width, height) = self.bullet, PICTURE
+        p, width, height = self.bullet, 400, 300
         view = p.computeViewMatrixFromYawPitchRoll(position, 2.2, math.degrees(yaw) - 60, -42, 0, 2)
         projection = p.computeProjectionMatrixFOV(55, width / height, 0.1, 40)
         rgba = p.getCameraImage(
@@ -489,8 +487,8 @@ class LocoEnv(gymnasium.Env):
         if not math.hypot(self._distance(robot), *robot.rates) < EXPLODED:  # or NaN
             self.simulation.bullet.disconnect()  # NaN has spread in it
             self.simulation = Simulation(self.pool, self.render_mode is not None, self.gui)
-            info = self._info(False, True) | {"exploded": True}
-            return np.zeros(self.observation_space.shape, np.float32), 0.0, True, False, info
+            nothing = np.zeros(self.observation_space.shape, np.float32)
+            return nothing, 0.0, True, False, self._info(False, True, exploded=True)
         self.robot = robot
         success = self._distance(robot) < GOAL_RADIUS
         fall = not success and (robot.up < FALL_UP or robot.sink > FALL_SPEED)
@@ -530,10 +528,10 @@ class LocoEnv(gymnasium.Env):
         return np.float32([*scan, self._distance(robot), heading, *robot.rates, *robot.joints,
                            *self.target, *s_tg])
 
-    def _info(self, success, fall):
+    def _info(self, success, fall, exploded=False):
         progress = 1.0 if success else 1.0 - self._distance(self.robot) / self.start_distance
         return {"task": self.terrain.name, "t_cr": max(0.0, progress), "success": success,
-                "fall": fall, "collisions": self.collisions, "exploded": False}
+                "fall": fall, "collisions": self.collisions, "exploded": exploded}
 
     def render(self):
         """The robot and the terrain around it, uint8 (300, 400, 3).
