@@ -131,7 +131,7 @@ def memory(num_envs, resets):
     """{label: value} of one of two ranks, as it collects: no gradients."""
     process, args = psutil.Process(), loco_mtrl.parse(["train"])
     before = process.memory_info().rss
-    make = [partial(loco_mtrl.training_env, i, (0, 0), args) for i in range(0, num_envs, 2)]
+    make = [partial(loco_mtrl.training_env, i, 0, args) for i in range(0, num_envs, 2)]
     with closing(gymnasium.vector.SyncVectorEnv(make)) as envs:
         envs.reset(seed=0)
         size = process.memory_info().rss
