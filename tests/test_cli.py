@@ -314,6 +314,16 @@ def test_gallery_draws_every_terrain(tmp_path, capsys):
         assert min(picture.size) > 500 and len(picture.convert("L").getcolors()) > 50
 
 
+@pytest.mark.parametrize(("world", "seed"), [("mountain", 10013), ("continuous", 10004)])
+def test_a_map_shows_the_way_even_where_it_is_found_only_from_the_start(world, seed):
+    Figure = pytest.importorskip("matplotlib.figure").Figure
+    axis, terrain = Figure().subplots(), loco_mtrl.make_world(world, seed)
+    loco_mtrl.draw_map(axis, terrain)
+    (way,) = [line for line in axis.lines if line.get_linestyle() == ":"]
+    ends = way.get_xydata()[[-1, 0]]
+    np.testing.assert_allclose(ends, [terrain.starts[0, :2], terrain.goals[0, :2]], atol=0.06)
+
+
 @pytest.mark.parametrize(("command", "words"), [
     ("", ["train", "eval", "play", "gallery"]), ("train", [", ".join(loco_mtrl.PILLAR_TASKS)]),
     ("eval", [*loco_mtrl.REFERENCES, "--json"]), ("play", ["maze", "--scan"]),
