@@ -920,7 +920,7 @@ def play(args):
     print(f"{info['task']}: t_cr {info['t_cr']:.2f}, {end} after {env.seconds:.1f} s")
     if not args.gui:
         some = frames[:: -(len(frames) // 8 + 1)]  # the last one among them: it shows the goal
-        palette = Image.fromarray(np.concatenate(some)).quantize(64)
+        palette = Image.fromarray(np.concatenate(some)).quantize(200)
         pictures = [Image.fromarray(frame).quantize(palette=palette, dither=0) for frame in frames]
         pictures[0].save(args.gif, save_all=True, append_images=pictures[1:], loop=0,
                          duration=round(1000 * GIF_EVERY * HOLD * DT))
@@ -934,9 +934,9 @@ def gallery(args):
 
     check_writable(args.out)
     names = [*PILLAR_TASKS, *WORLDS]
-    figure, rows = Figure(figsize=(15, 11), layout="constrained"), math.ceil(len(names) / 6)
+    figure, rows = Figure(figsize=(13, 12), layout="constrained"), math.ceil(len(names) / 5)
     for k, name in enumerate(tqdm(names, unit="terrain")):
-        axis = figure.add_subplot(rows, 6, k + 1)
+        axis = figure.add_subplot(rows, 5, k + 1)
         rng, unseen = np.random.default_rng(args.seed), name in WORLDS
         draw_map(axis, make_world(name, args.seed) if unseen else make_terrain(name, rng, 0.8))
         axis.set_title(name, color="tab:red" if unseen else "k", fontsize=13)
