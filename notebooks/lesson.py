@@ -41,7 +41,10 @@ def film(env, act, seed, seconds=60, start=0.0, **options):
 
 def gif(frames):
     """Camera frames as an animation in real time."""
-    pictures = [PIL.Image.fromarray(frame).quantize(64) for frame in frames]
+    pictures = [PIL.Image.fromarray(frame) for frame in frames]
+    for picture in pictures:
+        picture.thumbnail((420, 225))  # a lesson with its pictures is to stay under 1 MB
+    pictures = [picture.quantize(64, dither=0) for picture in pictures]
     file = io.BytesIO()
     pictures[0].save(file, "gif", save_all=True, append_images=pictures[1:], loop=0,
                      duration=round(1000 * FRAME))
@@ -52,7 +55,7 @@ def show_maps(terrains, columns=4):
     """Terrains from above, {title: Terrain}; returns the axes, one each."""
     rows = -(-len(terrains) // columns)
     figure, axes = plt.subplots(rows, columns, figsize=(13, 9 / columns * rows), squeeze=False,
-                                layout="constrained")
+                                layout="constrained", dpi=70)
     axes = axes.ravel()
     for axis, (title, terrain) in zip(axes, terrains.items(), strict=False):
         draw_map(axis, terrain)
