@@ -43,8 +43,9 @@ def gif(frames):
     """Camera frames as an animation in real time."""
     pictures = [PIL.Image.fromarray(frame) for frame in frames]
     for picture in pictures:
-        picture.thumbnail((420, 225))  # a lesson with its pictures is to stay under 1 MB
-    pictures = [picture.quantize(64, dither=0) for picture in pictures]
+        # A lesson with its pictures is to stay under 1 MB.
+        picture.thumbnail((420, 225), PIL.Image.Resampling.NEAREST)
+    pictures = [picture.quantize(32, dither=0) for picture in pictures]
     file = io.BytesIO()
     pictures[0].save(file, "gif", save_all=True, append_images=pictures[1:], loop=0,
                      duration=round(1000 * FRAME))
