@@ -45,7 +45,7 @@ def gif(frames):
     for picture in pictures:
         # A lesson with its pictures is to stay under 1 MB.
         picture.thumbnail((420, 225), PIL.Image.Resampling.NEAREST)
-    pictures = [picture.quantize(32, dither=0) for picture in pictures]
+    pictures = [picture.quantize(64, dither=0) for picture in pictures]
     file = io.BytesIO()
     pictures[0].save(file, "gif", save_all=True, append_images=pictures[1:], loop=0,
                      duration=round(1000 * FRAME))

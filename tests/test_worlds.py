@@ -22,8 +22,7 @@ def test_worlds_are_those_that_were_measured(name):
         np.testing.assert_allclose(found, expected, atol=1)
 
 
-# Not in dynamic, which is the two offices, with people: it would take as long as three others.
-@pytest.mark.parametrize("name", [name for name in WORLDS if name != "dynamic"])
+@pytest.mark.parametrize("name", WORLDS)
 def test_straight_scores_what_the_papers_policy_of_flat_ground_does(name):
     """Coarsely. `python tests/worlds.py` takes 200 layouts, and looks at the walker, too."""
     layouts = 60 if name == "cliff" else 20  # there, an episode lasts four seconds
