@@ -889,7 +889,7 @@ def draw_map(axis, terrain):
         axis.plot(*person.path.T, color="tab:orange", lw=1)
     if len(terrain.starts) == 1:
         nav = Navigation(terrain.heights, terrain.cell, terrain.climb)
-        # From the goal back, as find_routes looks: the other way a corner may be too narrow.
+        # From the goal back, as find_routes looks: diagonals count at other steps the other way.
         ends = (nav.cell(*place[0, :2]) for place in (terrain.goals, terrain.starts))
         axis.plot(*nav.way(*ends).T, "w:", lw=1.5)
     axis.plot(*terrain.starts[:, :2].T, "wo", ms=5, mec="k")
