@@ -81,10 +81,12 @@ SCAN_SHAPE, N_RAYS = LIDAR_AZIMUTHS.shape, LIDAR_AZIMUTHS.size
 
 
 def lidar_rays():
-    """Where the rays start (m) and their unit vectors, (N_RAYS, 3) each in the base frame.
+    """Where the rays start, m in the base frame, and their unit vectors, (N_RAYS, 3) each.
 
     Row by row from the lowest, left to right. They start ahead of the chassis or, those that look
     back, behind it: a ray that crosses the robot's own hulls costs many times one that does not.
+    The unit vectors turn with the robot's yaw alone, for the sensors hang level, in gimbals: on a
+    robot that tilts with the ground, fixed ones see a steep slope as they see a flat floor.
     """
     up, left = np.radians(LIDAR_ELEVATIONS)[:, None], np.radians(LIDAR_AZIMUTHS)
     up, left = (angle.ravel() for angle in np.broadcast_arrays(up, left))
@@ -154,7 +156,7 @@ class Robot(NamedTuple):
 
     position: tuple  # (x, y, z) m
     yaw: float  # rad
-    up: float  # z of the base's own z axis: 1 upright, 0 on its side
+    turn: np.ndarray  # (3, 3), from the base's frame; turn[2, 2]: 1 upright, 0 on its side
     sink: float  # m/s, downward speed
     rates: list  # 3 angular rates in the frame of the base, rad/s
     joints: list  # 12 angles, rad
@@ -189,8 +191,7 @@ class Simulation:
                                       Person.HEIGHT)
                        for _ in range(max(len(terrain.people) for terrain in pool))]
         self.flag = self._add_body(p.GEOM_SPHERE, (0.2, 0.8, 0.3, 1), 0.2)
-        sources, directions = lidar_rays()
-        self._rays = sources.tolist(), (sources + LIDAR_RANGE * directions).tolist()
+        self._rays = lidar_rays()
         self._gains = dict(positionGains=[POSITION_GAIN] * 12, velocityGains=[VELOCITY_GAIN] * 12,
                            forces=[MAX_TORQUE] * 12)
 
@@ -267,16 +268,21 @@ class Simulation:
         """The Robot as it is now."""
         p = self.bullet
         position, quaternion = p.getBasePositionAndOrientation(self.robot)
-        velocity, (wx, wy, wz) = p.getBaseVelocity(self.robot)
-        r = p.getMatrixFromQuaternion(quaternion)
-        rates = [r[i] * wx + r[3 + i] * wy + r[6 + i] * wz for i in range(3)]
+        velocity, rates = p.getBaseVelocity(self.robot)
+        turn = np.reshape(p.getMatrixFromQuaternion(quaternion), (3, 3))
+        yaw, rates = math.atan2(turn[1, 0], turn[0, 0]), (turn.T @ rates).tolist()
         joints = [joint[0] for joint in p.getJointStates(self.robot, self.joints)]
-        return Robot(position, math.atan2(r[3], r[0]), r[8], -velocity[2], rates, joints)
+        return Robot(position, yaw, turn, -velocity[2], rates, joints)
 
-    def scan(self):
+    def scan(self, robot):
         """What rayTestBatch says of each ray: body, link, fraction of the range, position, ..."""
-        return self.bullet.rayTestBatch(*self._rays, parentObjectUniqueId=self.robot,
-                                        parentLinkIndex=-1, collisionFilterMask=STATIC_GROUP)
+        sources, directions = self._rays
+        sources = sources @ robot.turn.T + robot.position
+        sin, cos = math.sin(robot.yaw), math.cos(robot.yaw)
+        level = [(cos, sin, 0), (-sin, cos, 0), (0, 0, 1)]  # the axes of the gimbals, as rows
+        ends = sources + LIDAR_RANGE * directions @ level
+        return self.bullet.rayTestBatch(sources.tolist(), ends.tolist(),
+                                        collisionFilterMask=STATIC_GROUP)
 
     def move_people(self, people, terrain, origin):
         """Puts the bodies where people are on the terrain; those that are not needed, far away."""
@@ -491,7 +497,7 @@ class LocoEnv(gymnasium.Env):
             return nothing, 0.0, True, False, self._info(False, True, exploded=True)
         self.robot = robot
         success = self._distance(robot) < GOAL_RADIUS
-        fall = not success and (robot.up < FALL_UP or robot.sink > FALL_SPEED)
+        fall = not success and (robot.turn[2, 2] < FALL_UP or robot.sink > FALL_SPEED)
         reward = (before - self._distance(robot)) / (HOLD * DT)
         return self.observe(), reward, success or fall, False, self._info(success, fall)
 
@@ -521,7 +527,7 @@ class LocoEnv(gymnasium.Env):
         robot, scan = self.robot, []
         if self.lidar:
             # The root spends most of the range [0, 1] on what is near, and still sees 5 m far.
-            scan = [math.sqrt(hit[2]) for hit in self.simulation.scan()]
+            scan = [math.sqrt(hit[2]) for hit in self.simulation.scan(robot)]
         dx, dy, _ = np.subtract(self.goal, robot.position).tolist()
         heading = math.remainder(math.atan2(dy, dx) - robot.yaw, 2 * math.pi)
         s_tg = self.generator.state() if self.generator else []
@@ -571,7 +577,7 @@ def make_env(tasks, seconds=30, **options):
 REWARD_SCALE = HOLD * DT  # rewards in metres of progress keep the critic's targets near 1
 LAYOUTS = 8  # terrains of each training environment
 PROGRAM = "python loco_mtrl.py"
-STAGE = 250_000  # steps; then every process starts itself afresh, on new layouts
+STAGE = 50_000  # steps; then every process starts itself afresh, on new layouts
 
 
 def stage(steps, args):

@@ -645,6 +645,7 @@ def learn(make_env, config, *, run_dir=None, resume=False, mirror=None, meta=Non
                     run.save(model, optimiser, history, episodes)
             if on_update and rank == 0:
                 on_update(model, row)
+        bar.leave = stopped or steps >= total  # in the end there is one bar, not one a stage
     if stopped or interrupted:
         raise KeyboardInterrupt
     return model, steps

@@ -222,12 +222,14 @@ class Navigation:
         row = self.free.shape[1]
         straight = np.array([-row, -1, 1, row])
         near = straight, np.r_[straight, -row - 1, -row + 1, row - 1, row + 1]
-        front, count = np.array([cell[0] * row + cell[1]]), 0
+        front, count, last = np.array([cell[0] * row + cell[1]]), 0, np.zeros(steps.size, int)
         while front.size:
             steps[front] = count
             count += 1
             around = (front[:, None] + near[count % 2]).ravel()
-            front = np.unique(around[steps[around] == np.inf])
+            front = around[steps[around] == np.inf]
+            last[front] = number = np.arange(front.size)  # each cell once: np.unique would sort
+            front = front[last[front] == number]
         return np.where(self.free, steps.reshape(self.free.shape) * CELL * 1.056, np.inf)
 
     def way(self, start, goal):

@@ -67,6 +67,6 @@ class Walker:
                 forward = min(forward, 0.0)
         aside = 0.12 * min(max(1.2 * turn, -1.0), 1.0)
         action[1:3] = (np.array([forward - aside, forward + aside]) - 0.13) / 0.27
-        tilt = math.acos(min(env.robot.up, 1.0))
+        tilt = math.acos(min(env.robot.turn[2, 2], 1.0))
         action[4] = -min(max(5 * (tilt - 0.1), 0.0), 0.95)
         return action
