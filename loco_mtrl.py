@@ -296,15 +296,23 @@ class Simulation:
     def touches_people(self):
         return any(self.bullet.getContactPoints(self.robot, body) for body in self.people)
 
-    def picture(self, position, yaw):
-        """The robot from above, behind and aside, uint8 (300, 400, 3)."""
+    def picture(self, position, yaw, hits):
+        """The robot from above, behind and aside, uint8 (300, 400, 3). hits (H, 3) m: red dots."""
         p, width, height = self.bullet, 400, 300
         view = p.computeViewMatrixFromYawPitchRoll(position, 2.2, math.degrees(yaw) - 60, -42, 0, 2)
         projection = p.computeProjectionMatrixFOV(55, width / height, 0.1, 40)
         rgba = p.getCameraImage(
             width, height, view, projection, lightDirection=(2, 3, 8), lightAmbientCoeff=0.65,
             lightDiffuseCoeff=0.5, lightSpecularCoeff=0.05, renderer=p.ER_TINY_RENDERER)[2]
-        return np.reshape(rgba, (height, width, 4))[..., :3].astype(np.uint8)
+        picture = np.reshape(rgba, (height, width, 4))[..., :3].astype(np.uint8)
+        # Bullet's matrices are for rows: (x, y, z, 1) @ view @ projection, then over the last.
+        camera = np.reshape(view, (4, 4)) @ np.reshape(projection, (4, 4))
+        seen = np.pad(np.reshape(hits, (-1, 3)), [(0, 0), (0, 1)], constant_values=1) @ camera
+        seen = seen[(np.abs(seen[:, :2]) < seen[:, 3:]).all(1)]  # within the picture
+        column, row = ((seen[:, :2] / seen[:, 3:] * (1, -1) + 1) / 2 * (width - 1, height - 1)).T
+        for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)):
+            picture[row.astype(int) + i, column.astype(int) + j] = 230, 30, 30
+        return picture
 
 
 # ------------------------------------------------------------------------------- the environment
@@ -540,7 +548,7 @@ class LocoEnv(gymnasium.Env):
                 "fall": fall, "collisions": self.collisions, "exploded": exploded}
 
     def render(self):
-        """The robot and the terrain around it, uint8 (300, 400, 3).
+        """The robot, the terrain around it and what its LiDAR hits, uint8 (300, 400, 3).
 
         Raises ValueError if the environment was made without render_mode.
         """
@@ -548,7 +556,9 @@ class LocoEnv(gymnasium.Env):
             raise ValueError("render() needs render_mode='rgb_array'")
         self._check_open(running=True)
         dx, dy, _ = np.subtract(self.goal, self.robot.position)
-        return self.simulation.picture(self.robot.position, math.atan2(dy, dx))
+        hits = self.simulation.scan(self.robot) if self.lidar else []
+        return self.simulation.picture(self.robot.position, math.atan2(dy, dx),
+                                       [hit[3] for hit in hits if hit[2] < 1])
 
     def _check_open(self, running=False):
         if self.simulation is None:

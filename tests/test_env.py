@@ -523,3 +523,21 @@ def test_pictures_show_the_robot(flat):
         assert rows.size > 500 and np.abs([rows.mean() - 150, columns.mean() - 200]).max() < 60
         rows, columns = np.nonzero(blue - red > 50)  # the blue thighs
         assert rows.size > 300 and np.abs([rows.mean() - 150, columns.mean() - 200]).max() < 60
+
+
+def test_pictures_show_what_the_lidar_hits():
+    pictures = []
+    for lidar in (True, False):
+        with closing(LocoEnv("flat", lidar=lidar, render_mode="rgb_array")) as env:
+            env.reset(seed=0)
+            pictures.append(env.render())
+            aside = np.add(env.goal, (0.8, 0.6, 0.0))  # so that the goal is not in the middle
+            behind = np.add(env.goal, (-9.0, -9.0, 9.0))
+            marked = env.simulation.picture(aside, 0.4, [env.goal, behind])
+    changed = (pictures[0] != pictures[1]).any(-1)
+    assert 100 < changed.sum() <= 640 and (pictures[0][changed] == (230, 30, 30)).all()
+    dot = np.argwhere((marked == (230, 30, 30)).all(-1))  # 2 x 2 pixels, on the green ball
+    red, green, blue = marked.astype(int).transpose(2, 0, 1)
+    ball = np.argwhere((green - red > 60) & (green - blue > 40))
+    assert len(dot) == 4 and len(ball) > 100
+    np.testing.assert_allclose(dot.mean(0), ball.mean(0), atol=6)  # its lit side alone is green
