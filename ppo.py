@@ -603,8 +603,8 @@ def learn(make_env, config, *, run_dir=None, resume=False, mirror=None, meta=Non
 
     At each checkpoint all envs are reset, and random numbers start afresh from (seed, update,
     rank): a run that was stopped goes on to the last bit as one that was not (with as many ranks).
-    Ctrl-C stops after the running update, with a checkpoint, by KeyboardInterrupt; a second one
-    aborts. Also raises what iterate, RunFolder, Collector and ActorCritic raise.
+    Ctrl-C stops all ranks after the running update, with a checkpoint, by KeyboardInterrupt; a
+    second one aborts. Also raises what iterate, RunFolder, Collector and ActorCritic raise.
     """
     torch.set_num_threads(1)  # more threads only cost time on nets this small
     rank, world = join_ranks()
@@ -627,8 +627,7 @@ def learn(make_env, config, *, run_dir=None, resume=False, mirror=None, meta=Non
             if fresh:
                 collector.reset(config.seed, len(history), rank)
             stats, seen = iterate(model, optimiser, collector, config, steps / total, mirror)
-            sums = sum_over_ranks(torch.tensor([seen, bool(interrupted)], dtype=torch.float64))
-            seen, stopped = sums.long().tolist()  # one Ctrl-C stops all ranks
+            seen, stopped = sum_over_ranks(torch.tensor([seen, bool(interrupted)])).tolist()
             steps += seen
             minutes += (stats["collect_s"] + stats["learn_s"]) / 60
             row = {"update": len(history) + 1, "steps": steps, "minutes": minutes,
