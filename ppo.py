@@ -8,6 +8,7 @@ or torchrun starts, on one machine or several.
 Shapes: T = num_steps, N = environments of one rank, B = any batch.
 """
 
+import atexit
 import contextlib
 import fcntl
 import io
@@ -84,6 +85,7 @@ def join_ranks():
         restart = os.environ.get("TORCHELASTIC_RESTART_COUNT"), os.environ.get("PPO_STAGE")
         store = dist.PrefixStore(str(restart), store)
         dist.init_process_group("gloo", store=store, rank=rank, world_size=world)
+        atexit.register(dist.destroy_process_group)  # or its threads, now and then, abort the exit
     return (dist.get_rank(), dist.get_world_size()) if dist.is_initialized() else (0, 1)
 
 
