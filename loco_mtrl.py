@@ -218,7 +218,7 @@ class Simulation:
         mesh = dict(vertices=terrain.vertices.tolist(), indices=terrain.triangles.ravel().tolist())
         shape = p.createCollisionShape(p.GEOM_MESH, flags=p.GEOM_FORCE_CONCAVE_TRIMESH, **mesh)
         body = p.createMultiBody(0, shape, basePosition=origin)
-        p.changeDynamics(body, -1, lateralFriction=1.0)
+        p.changeDynamics(body, -1, lateralFriction=terrain.friction)
         if not self.visual:
             return
         # Ground and walls in colours of their own: shading alone does not tell them apart.

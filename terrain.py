@@ -88,6 +88,7 @@ class Terrain:
     heights: np.ndarray  # (m, n) m, on cells of `cell` m
     cell: float
     climb: float = STEP  # m, highest step on the way to a goal
+    friction: float = 1.0  # coefficient
     people: list[Person] = field(default_factory=list)
 
     def height(self, x, y):
@@ -358,10 +359,10 @@ def stairs(rng, difficulty):
 
 
 def slopes(rng, difficulty):
-    """A ridge or a valley across the way, up and down at up to 35 degrees, to 2.1 m high."""
+    """A ridge or a valley across the way, up and down at up to 28 degrees, to 1.6 m high."""
     _, _, u = _grid(slopes.cell)
     up, down = rng.uniform(1.5, 3.0, 2)
-    steep = np.radians(min(45 * difficulty, 35) * rng.uniform(0.75, 1))
+    steep = np.radians(min(40 * difficulty, 28) * rng.uniform(0.75, 1))
     top = np.tan(steep) * min(up, down)
     a, b = np.sort(rng.uniform(up, SPAN - down, 2))
     return rng.choice([-1, 1]) * np.interp(u, [a - up, a, b, b + down], [0, top, top, 0])
@@ -462,11 +463,13 @@ def poles(rng, difficulty):
     return np.where(pole, rng.uniform(0.4, 1.2, x.shape), 0.0)
 
 
-# m: steps so low that feet slip on 30 degrees, as on smooth slopes of 20, until they crouch.
-slopes.cell = ridges.cell = L / 8
+# With this friction the level tops of such low pillars are as slippery as smooth slopes with 1: an
+# upright trot slips from 20 degrees on, a crouched one from 28.
+slopes.cell = ridges.cell = L / 8  # m
+slopes.friction = ridges.friction = 0.75
 hills.cell = L / 2  # m: steps so low that slopes feel, and look to the LiDAR, nearly smooth
 poles.cell = L / 3
-ridges.climb = 0.06  # m: the way leads round flanks steeper than 31 degrees
+ridges.climb = 0.05  # m: the way leads round flanks steeper than 27 degrees
 for _task in (obstacles, poles, corridors, walls, screens, traps):
     _task.fence = True  # walls all around: exploring along a wall must not lead off the border
 
@@ -481,9 +484,10 @@ def make_terrain(task, rng, difficulty):
     task: a name in PILLAR_TASKS, a function (rng, difficulty) -> heights (m, n) in m, or a
     finished Terrain, which is returned as it is. rng: numpy Generator; difficulty: in [0, 1].
     A function may have attributes: `cell`, m, the pillars' cross-section if it is not L; `climb`,
-    m, the highest step on a way if it is not STEP; `fence`, walls along the border.
-    Raises ValueError for an unknown task, a difficulty outside [0, 1], a bad cell or climb, heights
-    not finite, not 2-D or too many for PyBullet, and a task without a route in DRAWS draws.
+    m, the highest step on a way if it is not STEP; `friction`, if it is not 1; `fence`, walls along
+    the border.
+    Raises ValueError for an unknown task, a difficulty outside [0, 1], a bad attribute, heights not
+    finite, not 2-D or too many for PyBullet, and a task without a route in DRAWS draws.
     """
     if isinstance(task, Terrain):
         return task
@@ -493,10 +497,10 @@ def make_terrain(task, rng, difficulty):
         raise ValueError(f"difficulty must be in [0, 1], got {difficulty}")
     generate = task if callable(task) else PILLAR_TASKS[task]
     name, cell = getattr(generate, "__name__", "terrain"), getattr(generate, "cell", L)
-    climb = getattr(generate, "climb", STEP)
-    for what, value in (("cell", cell), ("climb", climb)):
+    climb, friction = getattr(generate, "climb", STEP), getattr(generate, "friction", 1.0)
+    for what, value in (("cell", cell), ("climb", climb), ("friction", friction)):
         if not isinstance(value, Real) or not 0.02 <= value <= 10:
-            raise ValueError(f"task {name!r}: {what} must be from 0.02 to 10 m, got {value!r}")
+            raise ValueError(f"task {name!r}: {what} must be from 0.02 to 10, got {value!r}")
     for _ in range(DRAWS):
         heights = np.array(generate(rng, difficulty), float)
         if heights.ndim != 2 or not heights.size or not np.isfinite(heights).all():
@@ -516,7 +520,7 @@ def make_terrain(task, rng, difficulty):
             routes[0][2::3, 3] += rng.uniform(-np.pi, np.pi, len(routes[0][2::3]))
             mesh = fuse_pillars(heights, cell)
             check_size(name, *mesh)
-            return Terrain(name, *mesh, *routes, heights, cell, climb)
+            return Terrain(name, *mesh, *routes, heights, cell, climb, friction)
     raise ValueError(f"task {name!r} gave no walkable route in {DRAWS} draws of {heights.shape}")
 
 
@@ -752,7 +756,7 @@ def make_world(name, seed, **changes):
         routes = find_routes(nav, rng, 1, world.goal, world.detour, floor=world.floor)
         people = [_person(rng, nav, routes[0][0]) for _ in range(world.people) if routes]
         if routes and None not in people:
-            return Terrain(name, *join(meshes), *routes, plan, CELL, world.climb, people)
+            return Terrain(name, *join(meshes), *routes, plan, CELL, world.climb, people=people)
     raise ValueError(f"world {name!r} has no walkable route with seed {seed}")
 
 

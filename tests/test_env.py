@@ -171,6 +171,12 @@ def test_lidar_never_sees_the_robot(flat):
     np.testing.assert_array_equal(put(flat, 6.0, 0.0, 0.9)[:160], before)
 
 
+def test_every_terrain_has_its_own_friction():
+    with closing(LocoEnv(["flat", "slopes", "stairs", "ridges"])) as env:
+        frictions = [env.simulation.bullet.getDynamicsInfo(body, -1)[1] for body in range(4)]
+        assert frictions == pytest.approx([1, 0.75, 1, 0.75])
+
+
 @pytest.mark.parametrize("side", [1, -1])
 def test_lidar_still_sees_a_thin_wall_that_it_touches(side):
     """A lens that entered what the robot leans on, head or tail, would be blind to it."""

@@ -338,7 +338,7 @@ def test_tasks_can_be_stood_on_and_walked(task, difficulty):
     place = make_terrain(task, rng(7), difficulty)
     size, pad = np.array(place.heights.shape) * place.cell, round(1.8 / place.cell)
     assert place.name == task and size == pytest.approx([12, 8])
-    assert place.climb == (0.06 if task == "ridges" else terrain.STEP)
+    assert place.climb == (0.05 if task == "ridges" else terrain.STEP)
     assert np.isfinite(place.vertices).all() and place.triangles.max() < len(place.vertices)
     assert len(place.triangles) < (45_000 if task == "hills" else 16_000)
     fence = min(1.2, 4 * difficulty) if hasattr(terrain.PILLAR_TASKS[task], "fence") else 0
@@ -817,12 +817,12 @@ def test_own_terrains_beyond_pybullets_limit_are_named():
         make_terrain(gravel, np.random.default_rng(0), 0.5)
 
 
-@pytest.mark.parametrize("name", ["cell", "climb"])
+@pytest.mark.parametrize("name", ["cell", "climb", "friction"])
 @pytest.mark.parametrize("value", [(0.2, 0.1), "x", None, 0, -1, 1e-9, np.nan, np.inf])
-def test_own_terrains_with_a_bad_cell_or_climb_are_named(name, value):
+def test_own_terrains_with_a_bad_attribute_are_named(name, value):
     def mine(rng, difficulty):
         return np.zeros((60, 40))
 
     setattr(mine, name, value)
-    with pytest.raises(ValueError, match=rf"task 'mine': {name} must be from 0.02 to 10 m"):
+    with pytest.raises(ValueError, match=rf"task 'mine': {name} must be from 0.02 to 10,"):
         make_terrain(mine, np.random.default_rng(0), 0.5)
