@@ -463,13 +463,13 @@ def poles(rng, difficulty):
     return np.where(pole, rng.uniform(0.4, 1.2, x.shape), 0.0)
 
 
-# With this friction the level tops of such low pillars are as slippery as smooth slopes with 1: an
-# upright trot slips from 20 degrees on, a crouched one from 28.
+# With these frictions the level tops of low pillars are as slippery as smooth slopes with 1: an
+# upright trot slips from some 20 degrees on, a crouched one from 28.
 slopes.cell = ridges.cell = L / 8  # m
 slopes.friction = ridges.friction = 0.75
-hills.cell = L / 2  # m: steps so low that slopes feel, and look to the LiDAR, nearly smooth
+hills.cell, hills.friction = L / 2, 0.5
 poles.cell = L / 3
-ridges.climb = 0.05  # m: the way leads round flanks steeper than 27 degrees
+ridges.climb = hills.climb = 0.05  # m: the way leads round flanks steeper than 27 degrees
 for _task in (obstacles, poles, corridors, walls, screens, traps):
     _task.fence = True  # walls all around: exploring along a wall must not lead off the border
 

@@ -338,7 +338,7 @@ def test_tasks_can_be_stood_on_and_walked(task, difficulty):
     place = make_terrain(task, rng(7), difficulty)
     size, pad = np.array(place.heights.shape) * place.cell, round(1.8 / place.cell)
     assert place.name == task and size == pytest.approx([12, 8])
-    assert place.climb == (0.05 if task == "ridges" else terrain.STEP)
+    assert place.climb == (0.05 if task in ("ridges", "hills") else terrain.STEP)
     assert np.isfinite(place.vertices).all() and place.triangles.max() < len(place.vertices)
     assert len(place.triangles) < (45_000 if task == "hills" else 16_000)
     fence = min(1.2, 4 * difficulty) if hasattr(terrain.PILLAR_TASKS[task], "fence") else 0
