@@ -88,7 +88,7 @@ class Terrain:
     heights: np.ndarray  # (m, n) m, on cells of `cell` m
     cell: float
     climb: float = STEP  # m, highest step on the way to a goal
-    friction: float = 1.0  # coefficient
+    friction: float = 1.0  # of the ground, Bullet's coefficient
     people: list[Person] = field(default_factory=list)
 
     def height(self, x, y):
@@ -463,8 +463,8 @@ def poles(rng, difficulty):
     return np.where(pole, rng.uniform(0.4, 1.2, x.shape), 0.0)
 
 
-# With these frictions the level tops of low pillars are as slippery as smooth slopes with 1: an
-# upright trot slips from some 20 degrees on, a crouched one from 28.
+# With these frictions the level tops of low pillars are about as slippery as smooth ground with 1:
+# an upright trot slips from some 20 degrees on, a crouched one from some 30.
 slopes.cell = ridges.cell = L / 8  # m
 slopes.friction = ridges.friction = 0.75
 hills.cell, hills.friction = L / 2, 0.5
