@@ -364,7 +364,7 @@ def observation_parts(tg=True, lidar=True):
 def action_parts(tg=True):
     """What an action consists of."""
     if not tg:
-        return [Part("joint offsets from the standing pose", -1, 1, SWAP_LEGS, std=0.25)]
+        return [Part("joint offsets from the standing pose", -1, 1, SWAP_LEGS, std=0.5)]
     return [Part("TG: parameters", -1, 1, SWAP_STRIDES, std=0.3),
             Part("joint residuals", -1, 1, SWAP_LEGS, std=0.5)]
 
