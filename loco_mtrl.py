@@ -6,14 +6,11 @@ Diverse Environments"; the sections named below are the paper's.
 """
 
 import argparse
-import concurrent.futures
 import contextlib
 import copy
-import functools
 import itertools
 import json
 import math
-import multiprocessing
 import os
 import shlex
 import signal
@@ -22,6 +19,9 @@ import sys
 import tempfile
 import time
 import xml.etree.ElementTree as ET
+from concurrent.futures import ProcessPoolExecutor
+from functools import lru_cache, partial
+from multiprocessing import get_context
 from numbers import Real
 from pathlib import Path
 from typing import NamedTuple
@@ -32,16 +32,7 @@ import torch
 from tqdm import tqdm
 
 from ppo import PPOConfig, learn, load_policy, note_interrupt, save_policy
-from terrain import (
-    PILLAR_TASKS,
-    WORLDS,
-    Navigation,
-    Person,
-    Terrain,
-    load_scan,
-    make_terrain,
-    make_world,
-)
+from terrain import PILLAR_TASKS, WORLDS, Navigation, Terrain, load_scan, make_terrain, make_world
 from tg import LEGS, STANDING, TrajectoryGenerator
 
 
@@ -109,7 +100,6 @@ AWAY, PARKED = (-1000.0, 0.0, 0.0), (-2000.0, 0.0, 0.0)
 PAINT = {"chassis": (0.95, 0.75, 0.15), "hip": (0.9, 0.35, 0.15), "upper": (0.25, 0.45, 0.8),
          "lower": (0.9, 0.9, 0.92), "toe": (0.2, 0.2, 0.2)}  # of a link, by a part of its name
 
-
 # Collision shapes in place of the convex hulls, with which most of a step would be spent on hull
 # against triangle: link, centre (m), roll (rad), kind, size (m). The two lenses are of the LiDAR.
 SHAPES = [
@@ -123,14 +113,12 @@ SHAPES = [
 ]
 
 
-def robot_urdf(visual):
-    """The Laikago's URDF as text, with SHAPES. Pictures, 0.3 s and 170 MB, only if `visual`."""
+def robot_urdf():
+    """The Laikago's URDF, an ElementTree, with SHAPES."""
     tree = ET.parse(LAIKAGO)
     for mesh in tree.iter("mesh"):
         mesh.set("filename", str(LAIKAGO.parent / mesh.get("filename")))
     for link in tree.iter("link"):
-        for part in link.findall("visual") if not visual else ():
-            link.remove(part)
         for contact in link.findall("contact"):
             contact.clear()  # drops spinning friction and the toes' friction anchors
             ET.SubElement(contact, "lateral_friction", value="1")
@@ -143,7 +131,7 @@ def robot_urdf(visual):
                 xyz = " ".join(map(str, centre))
                 ET.SubElement(collision, "origin", xyz=xyz, rpy=f"{roll} 0 0")
                 ET.SubElement(ET.SubElement(collision, "geometry"), kind, **size)
-    return ET.tostring(tree.getroot(), encoding="unicode")
+    return tree
 
 
 def _about_z(yaw):
@@ -172,8 +160,7 @@ class Simulation:
     def __init__(self, pool, visual, gui):
         self.visual = visual or gui
         with quiet():
-            mode = pybullet.GUI if gui else pybullet.DIRECT
-            self.bullet = p = BulletClient(connection_mode=mode)
+            self.bullet = p = BulletClient(pybullet.GUI if gui else pybullet.DIRECT)
             p.configureDebugVisualizer(p.COV_ENABLE_GUI, 0)
         p.setGravity(0, 0, -9.81)
         self.chequers = p.loadTexture(str(CHEQUERS)) if self.visual else None
@@ -187,9 +174,9 @@ class Simulation:
             edge += high - low + 2 * LIDAR_RANGE
             self._add_terrain(terrain, self.origins[-1])
         self.load_robot()
-        self.people = [self._add_body(p.GEOM_CYLINDER, (0.9, 0.5, 0.2, 1), Person.RADIUS,
-                                      Person.HEIGHT)
-                       for _ in range(max(len(terrain.people) for terrain in pool))]
+        crowd = max((terrain.people for terrain in pool), key=len)
+        self.people = [self._add_body(p.GEOM_CYLINDER, (0.9, 0.5, 0.2, 1), who.RADIUS, who.HEIGHT)
+                       for who in crowd]
         self.flag = self._add_body(p.GEOM_SPHERE, (0.2, 0.8, 0.3, 1), 0.2)
         self._rays = lidar_rays()
         self._gains = dict(positionGains=[POSITION_GAIN] * 12, velocityGains=[VELOCITY_GAIN] * 12,
@@ -200,10 +187,10 @@ class Simulation:
 
     def load_robot(self):
         p = self.bullet
-        with tempfile.NamedTemporaryFile("w", suffix=".urdf") as file:
-            file.write(robot_urdf(self.visual))
-            file.flush()
-            self.robot = p.loadURDF(file.name, AWAY)
+        looks = 0 if self.visual else p.URDF_IGNORE_VISUAL_SHAPES  # they take 0.3 s and 170 MB
+        with tempfile.NamedTemporaryFile(suffix=".urdf") as file:
+            robot_urdf().write(file.name)
+            self.robot = p.loadURDF(file.name, AWAY, flags=looks)
         joints = [p.getJointInfo(self.robot, j) for j in range(p.getNumJoints(self.robot))]
         ids = {joint[1].decode(): joint[0] for joint in joints}
         self.joints = [ids[f"{leg}_{joint}"] for leg in LEGS for joint in JOINTS]
@@ -246,16 +233,14 @@ class Simulation:
 
     def place(self, position, yaw, joints):
         """Puts the robot down, at rest. What happens next depends on nothing that was before."""
-        self._put(AWAY, yaw, joints)  # far away first: there Bullet forgets old contacts
-        self.step(joints)
-        self._put(position, yaw, joints)
-
-    def _put(self, position, yaw, joints):
         p = self.bullet
-        p.resetBasePositionAndOrientation(self.robot, position, _about_z(yaw))
-        p.resetBaseVelocity(self.robot, [0, 0, 0], [0, 0, 0])
-        for joint, angle in zip(self.joints, joints, strict=True):
-            p.resetJointState(self.robot, joint, angle)
+        for place in (AWAY, position):  # far away first: there Bullet forgets old contacts
+            p.resetBasePositionAndOrientation(self.robot, place, _about_z(yaw))
+            p.resetBaseVelocity(self.robot, [0, 0, 0], [0, 0, 0])
+            for joint, angle in zip(self.joints, joints, strict=True):
+                p.resetJointState(self.robot, joint, angle)
+            if place is AWAY:
+                self.step(joints)
 
     def step(self, targets):
         """One control step with the PD controllers' targets (12 joint angles, rad)."""
@@ -290,7 +275,7 @@ class Simulation:
             place, yaw = PARKED, 0.0
             if person:
                 x, y, yaw = person.place()
-                place = (x + origin[0], y, float(terrain.height(x, y)) + Person.HEIGHT / 2)
+                place = (x + origin[0], y, float(terrain.height(x, y)) + person.HEIGHT / 2)
             self.bullet.resetBasePositionAndOrientation(body, place, _about_z(yaw))
 
     def touches_people(self):
@@ -318,8 +303,6 @@ class Simulation:
 # ------------------------------------------------------------------------------- the environment
 
 HOLD = 3  # control steps that one decision of the policy lasts: it decides at 10 Hz
-# Share of a new action that takes effect in one control step: TG parameters, joint residuals.
-SMOOTHING = {"tg": 0.2, "joints": 0.5}
 RESIDUAL = {True: 0.04, False: 0.6}  # rad that a joint's action of 1 means, with and without TG
 BASE_HEIGHT = 0.28  # m, of the base above the ground in the standing pose
 GOAL_RADIUS = 0.5  # m, r_g
@@ -337,6 +320,7 @@ class Part(NamedTuple):
     image: list
     sign: int | list = 1  # one for all entries, or one for each
     std: float = 0.0  # of an action's exploration noise at first
+    share: float = 0.0  # of a new action that takes effect in one control step
 
     @property
     def size(self):
@@ -364,14 +348,14 @@ def observation_parts(tg=True, lidar=True):
 def action_parts(tg=True):
     """What an action consists of."""
     if not tg:
-        return [Part("joint offsets from the standing pose", -1, 1, SWAP_LEGS, std=0.5)]
-    return [Part("TG: parameters", -1, 1, SWAP_STRIDES, std=0.3),
-            Part("joint residuals", -1, 1, SWAP_LEGS, std=0.5)]
+        return [Part("joint offsets from the standing pose", -1, 1, SWAP_LEGS, std=0.5, share=0.5)]
+    return [Part("TG: parameters", -1, 1, SWAP_STRIDES, std=0.3, share=0.2),
+            Part("joint residuals", -1, 1, SWAP_LEGS, std=0.5, share=0.5)]
 
 
 def box(parts):
     """The Gymnasium space of all parts."""
-    bounds = np.float32([(part.low, part.high) for part in parts for _ in range(part.size)])
+    bounds = np.float32([(part.low, part.high) for part in parts for _ in part.image])
     return gymnasium.spaces.Box(*bounds.T)
 
 
@@ -394,7 +378,7 @@ class LocoEnv(gymnasium.Env):
     5 parameters of the trajectory generator (`tg.PARAMETERS`), then the 12 residuals u_fb;
     u_tg + u_fb are joint targets, which PD controllers with limited torque track (section 2.2).
     With tg=False (reactive), 12 offsets from the standing pose. An action is held for HOLD control
-    steps of DT s, in which what is in force moves toward it (SMOOTHING).
+    steps of DT s, in which what is in force moves toward it (`Part.share`).
 
     ## Reward
     (d_{t-1} - d_t) / dt, the velocity toward the goal, m/s. The paper prints the opposite sign but
@@ -410,7 +394,7 @@ class LocoEnv(gymnasium.Env):
 
     Args:
         tasks: a task's name, a function (rng, difficulty) -> heights, a finished Terrain, or a list
-            of these; None: all pillar tasks. The policy is not told which.
+            of these. The policy is not told which.
         difficulty: (low, high) in [0, 1], to draw it from, once for each terrain.
         tg, lidar: the paper's ablations (section 3) leave one of them out.
         layouts: how many terrains of each task to build. An episode draws one of them all.
@@ -423,8 +407,8 @@ class LocoEnv(gymnasium.Env):
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": round(1 / DT / HOLD)}
 
-    def __init__(self, tasks=None, difficulty=(0.0, 1.0), tg=True, lidar=True, layouts=1,
-                 pool_seed=0, render_mode=None, gui=False):
+    def __init__(self, tasks=tuple(PILLAR_TASKS), difficulty=(0.0, 1.0), tg=True, lidar=True,
+                 layouts=1, pool_seed=0, render_mode=None, gui=False):
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
         numbers = np.shape(difficulty) == (2,) and all(isinstance(d, Real) for d in difficulty)
@@ -432,7 +416,6 @@ class LocoEnv(gymnasium.Env):
             raise ValueError(f"difficulty must be (low, high) in [0, 1], got {difficulty}")
         if not isinstance(layouts, (int, np.integer)) or layouts < 1:
             raise ValueError(f"layouts must be a whole number of at least 1, got {layouts!r}")
-        tasks = list(PILLAR_TASKS) if tasks is None else tasks
         tasks = tasks if isinstance(tasks, (list, tuple)) else [tasks]
         if not tasks:
             raise ValueError(f"tasks must hold at least one task; valid: {', '.join(PILLAR_TASKS)}")
@@ -443,8 +426,7 @@ class LocoEnv(gymnasium.Env):
         self.generator = TrajectoryGenerator() if tg else None
         self.observation_space = box(observation_parts(tg, lidar))
         self.action_space = box(action_parts(tg))
-        n_tg = len(self.action_space.low) - 12
-        self.smoothing = [SMOOTHING["tg"]] * n_tg + [SMOOTHING["joints"]] * 12
+        self.smoothing = [part.share for part in action_parts(tg) for _ in part.image]
         self.residual = RESIDUAL[bool(tg)]
         self.simulation = Simulation(self.pool, render_mode is not None, gui)
         self.robot = None  # no episode yet
@@ -493,10 +475,9 @@ class LocoEnv(gymnasium.Env):
         before = self._distance(self.robot)
         for _ in range(HOLD):
             self._control(action)
-        if self.people:
-            touching = self.simulation.touches_people()
-            self.collisions += touching and not self.touching
-            self.touching = touching
+        touching = self.simulation.touches_people()
+        self.collisions += touching and not self.touching
+        self.touching = touching
         robot = self.simulation.sense()
         if not math.hypot(self._distance(robot), *robot.rates) < EXPLODED:  # or NaN
             self.simulation.bullet.disconnect()  # NaN has spread in it
@@ -520,11 +501,9 @@ class LocoEnv(gymnasium.Env):
         self.target = [u + self.residual * a for u, a in pairs]  # u_tg + u_fb
         self.simulation.step(self.target)
         self.seconds += DT
-        if self.people:
-            x, y, _ = np.subtract(self.robot.position, self.origin)
-            for person in self.people:
-                person.walk(DT, (x, y))
-            self.simulation.move_people(self.people, self.terrain, self.origin)
+        for person in self.people:
+            person.walk(DT, np.subtract(self.robot.position, self.origin)[:2])
+        self.simulation.move_people(self.people, self.terrain, self.origin)
 
     def _distance(self, robot):
         """From the robot's base to the goal, m."""
@@ -578,8 +557,7 @@ gymnasium.register("LocoMTRL-v0", LocoEnv, max_episode_steps=300)
 
 def make_env(tasks, seconds=30, **options):
     """A LocoEnv whose episodes last at most so many seconds. options: LocoEnv's."""
-    return gymnasium.make("LocoMTRL-v0", tasks=tasks, disable_env_checker=True,
-                          max_episode_steps=round(seconds / DT / HOLD), **options)
+    return gymnasium.wrappers.TimeLimit(LocoEnv(tasks, **options), round(seconds / DT / HOLD))
 
 
 # ------------------------------------------------------------------------------- train
@@ -623,7 +601,7 @@ def train(args):
     observation, action = observation_parts(args.tg, args.lidar), action_parts(args.tg)
     config = PPOConfig(
         total_timesteps=args.steps, seed=args.seed, n_scan=N_RAYS * args.lidar,
-        init_std=tuple(part.std for part in action for _ in range(part.size)))
+        init_std=tuple(part.std for part in action for _ in part.image))
     writer = None
     if args.tensorboard and first:
         from torch.utils.tensorboard import SummaryWriter
@@ -641,7 +619,7 @@ def train(args):
 
     try:
         model, steps = learn(
-            functools.partial(training_env, args=args), config, run_dir=run_dir, meta=meta,
+            partial(training_env, args=args), config, run_dir=run_dir, meta=meta,
             resume=args.resume or stages > 0 or crashed and checkpoint.exists(),
             mirror=(mirror(observation), mirror(action)), stage_end=lambda n: stage(n, args)[2],
             episode_keys=("t_cr", "success", "fall", "exploded"), on_update=on_update)
@@ -658,7 +636,6 @@ def train(args):
         save_policy(run_dir / "policy.pt", model, meta)
         draw_curve(run_dir)
         print(f"Policy: {run_dir}/policy.pt   Curve: {run_dir}/curve.png")
-    return 0
 
 
 def draw_curve(run_dir):
@@ -721,8 +698,9 @@ def again(args):
     return f"{os.environ.get('LOCO_MTRL', PROGRAM)} {shlex.join([*kept, '--resume'])}"
 
 
-# ------------------------------------------------------------------------------- eval
+# ------------------------------------------------------------------------------- eval, play
 
+GIF_EVERY = 2  # decisions a frame: 5 frames a second
 EVAL_SECONDS = 60  # an episode's limit
 EVAL_SEED = 10_000  # episode k of every policy in every world has seed EVAL_SEED + k
 # Tables 1 and 2, t_cr in the order of WORLDS: means, then standard deviations, in hundredths.
@@ -737,7 +715,6 @@ PAPER = {
     "sequential": "60 29 63 62 59 61 57 61  18 15 17 14 19 13 14 17",
     "ours": "72 67 84 83 79 78 70 72  13 12 11 13 14 10 17 19",
 }
-BLIND = {"lidar": False}  # LocoEnv's options for the references: they need no scan
 
 
 def zero(observation):
@@ -754,21 +731,20 @@ def straight(observation):
 REFERENCES = {"zero": zero, "straight": straight}
 
 
-@functools.lru_cache
+@lru_cache
 def load_actor(name):
     """(act, options, row): observation -> action, LocoEnv's options, the row's name in PAPER.
 
     `name` is a checkpoint's path or one of REFERENCES. Raises as `load_checkpoint` does.
     """
     if name in REFERENCES:
-        return REFERENCES[name], BLIND, None
+        return REFERENCES[name], {"lidar": False}, None
     model, meta = load_policy(name)
     if not {"tg", "lidar", "tasks", "sequential"} <= set(meta or {}) or not meta["tasks"]:
         raise ValueError(f"{name} is not a policy for LocoEnv: {meta}")
     options, tasks = {"tg": meta["tg"], "lidar": meta["lidar"]}, meta["tasks"]
-    sizes = [sum(part.size for part in parts)
-             for parts in (observation_parts(**options), action_parts(meta["tg"]))]
-    given = [model.kwargs["obs_dim"], model.kwargs["act_dim"]]
+    sizes = box(observation_parts(**options)).shape + box(action_parts(meta["tg"])).shape
+    given = model.kwargs["obs_dim"], model.kwargs["act_dim"]
     if sizes != given:
         raise ValueError(f"{name} is for observations and actions of {given} numbers, but a robot "
                          f"here has {sizes}")
@@ -787,21 +763,16 @@ def open_scan(args):
     return scan
 
 
-def make_place(place, seed):
-    """The terrain of episode `seed`: of a world, a task on held-out seeds, or a given one."""
-    if isinstance(place, Terrain):
-        return place
-    if place in WORLDS:
-        return make_world(place, seed)
-    # By the golden ratio the difficulties of a few seeds in a row are spread evenly, too.
-    return make_terrain(place, np.random.default_rng(seed), 0.618034 * seed % 1)
-
-
 def episode(actor, place, seed, **options):
-    """One episode, step by step: yields (env, info), at first of the reset."""
+    """One episode, step by step: yields (env, info), at first of the reset.
+
+    place: a world, a training task, on held-out seeds, or a Terrain. options: LocoEnv's.
+    """
     act, kind, _ = load_actor(actor)
-    env = make_env(make_place(place, seed), seconds=EVAL_SECONDS, **kind, **options)
-    with contextlib.closing(env):
+    # By the golden ratio the difficulties of a few seeds in a row are spread evenly, too.
+    rng, difficulty = np.random.default_rng(seed), 0.618034 * seed % 1
+    place = make_world(place, seed) if place in WORLDS else make_terrain(place, rng, difficulty)
+    with contextlib.closing(make_env(place, EVAL_SECONDS, **kind, **options)) as env:
         observation, info = env.reset(seed=seed)
         terminated = truncated = False
         yield env.unwrapped, info
@@ -813,30 +784,29 @@ def episode(actor, place, seed, **options):
 def score(actor, place, seed):
     """The score of one episode: {t_cr, success, fall, collisions, seconds}."""
     torch.set_num_threads(1)
-    *_, (info, seconds) = ((info, env.seconds) for env, info in episode(actor, place, seed))
+    *_, (env, info) = episode(actor, place, seed)
     keys = ("t_cr", "success", "fall", "collisions")
-    return {key: float(info[key]) for key in keys} | {"seconds": seconds}
+    return {key: float(info[key]) for key in keys} | {"seconds": env.seconds}
 
 
-def evaluate(actors, places, n_episodes, workers, first_seed=EVAL_SEED):
+def evaluate(actors, places, n_episodes, workers):
     """Scores of every actor in every place: {(actor, place's name): [score's dict, ...]}.
 
     Every episode has an environment of its own, so the scores do not depend on `workers`.
     Raises RuntimeError if a worker is killed, or if a script calls it without a main guard.
     """
-    jobs = [(actor, place, first_seed + k)
-            for place in places for actor in actors for k in range(n_episodes)]
+    seeds = range(EVAL_SEED, EVAL_SEED + n_episodes)
+    jobs = [(actor, place, seed) for place in places for actor in actors for seed in seeds]
     scores = {}
     with tqdm(total=len(jobs), unit="episode") as bar:
         while jobs:  # new workers now and then, for Bullet never frees a mesh
             some, jobs = jobs[:200], jobs[200:]
-            pool = concurrent.futures.ProcessPoolExecutor(
-                workers, multiprocessing.get_context("spawn"))
+            pool = ProcessPoolExecutor(workers, get_context("spawn"))
             try:
                 with deaf():
                     results = pool.map(score, *zip(*some, strict=True))
-                for job, result in zip(some, results, strict=True):
-                    scores.setdefault((job[0], getattr(job[1], "name", job[1])), []).append(result)
+                for (actor, place, _), result in zip(some, results, strict=True):
+                    scores.setdefault((actor, getattr(place, "name", place)), []).append(result)
                     bar.update()
             finally:
                 pool.shutdown(cancel_futures=True)
@@ -851,34 +821,26 @@ def eval_command(args):
         check_writable(args.json)
     scores = evaluate(args.policies, places, args.episodes, args.ranks)
     names = list(dict.fromkeys(name for _, name in scores))
-    report = {"policies": args.policies, "episodes": args.episodes, "worlds": {}}
+    table = {}
     for name in names:
         runs = [run for actor in args.policies for run in scores[actor, name]]
-        each = [float(np.mean([run["t_cr"] for run in scores[actor, name]]))
-                for actor in args.policies]
-        report["worlds"][name] = {
-            **{key: float(np.mean([run[key] for run in runs])) for key in runs[0]},
-            "std": float(np.std([run["t_cr"] for run in runs])), "per_policy": each}
-    table = report["worlds"]
+        t_cr = np.reshape([run["t_cr"] for run in runs], (len(args.policies), -1))
+        means = {key: float(np.mean([run[key] for run in runs])) for key in runs[0]}
+        table[name] = means | {"std": float(t_cr.std()), "per_policy": t_cr.mean(1).tolist()}
     lines = [("", names)] + [(key, [f"{table[name][key]:.2f}" for name in names]) for key in
                              ("t_cr", "std", "success", "fall", "collisions", "seconds")]
     if names == list(WORLDS):
-        for kind in [kind for kind in PAPER if kind in kinds]:
+        for kind in (kind for kind in PAPER if kind in kinds):
             figures = ["0." + figure for figure in PAPER[kind].split()]
             lines += [(f"paper: {kind}", figures[:8]), ("paper: std", figures[8:])]
     for name, cells in lines:
         print(f"{name:18}" + "".join(f"{cell:>12}" for cell in cells))
-    report["mean_t_cr"] = float(np.mean([world["t_cr"] for world in table.values()]))
     for k, actor in enumerate(args.policies):
         print(f"mean t_cr {np.mean([w['per_policy'][k] for w in table.values()]):.3f}  {actor}")
     if args.json:
+        report = {"policies": args.policies, "episodes": args.episodes, "worlds": table,
+                  "mean_t_cr": float(np.mean([world["t_cr"] for world in table.values()]))}
         Path(args.json).write_text(json.dumps(report, indent=2) + "\n")
-    return 0
-
-
-# ------------------------------------------------------------------------------- play, gallery
-
-GIF_EVERY = 2  # decisions a frame: 5 frames a second
 
 
 def check_writable(path):
@@ -941,7 +903,6 @@ def play(args):
         pictures[0].save(args.gif, save_all=True, append_images=pictures[1:], loop=0,
                          duration=round(1000 * GIF_EVERY * HOLD * DT))
         print(args.gif)
-    return 0
 
 
 def gallery(args):
@@ -958,7 +919,6 @@ def gallery(args):
         axis.set_title(name, color="tab:red" if unseen else "k", fontsize=13)
     figure.savefig(args.out, dpi=75)
     print(args.out)
-    return 0
 
 
 # ------------------------------------------------------------------------------- command line
@@ -990,14 +950,14 @@ def parse(argv):
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     parser = argparse.ArgumentParser("loco_mtrl.py", description=__doc__.split("\n")[0])
     commands = parser.add_subparsers(dest="command")
-    places = functools.partial(_names, [*WORLDS, *PILLAR_TASKS], "world")
-    natural, positive = functools.partial(_whole, 0), functools.partial(_whole, 1)
+    places = partial(_names, [*WORLDS, *PILLAR_TASKS], "world")
+    natural, positive = partial(_whole, 0), partial(_whole, 1)
     ranks = dict(type=positive, default=cores, help="processes; default: every core")
 
     p = commands.add_parser("train", help="train a policy")
     p.add_argument("--steps", type=positive, default=PPOConfig.total_timesteps,
                    help="decisions of the policy, in all (default %(default)s)")
-    p.add_argument("--tasks", type=functools.partial(_names, PILLAR_TASKS, "task"), metavar="TASKS",
+    p.add_argument("--tasks", type=partial(_names, PILLAR_TASKS, "task"), metavar="TASKS",
                    default=list(PILLAR_TASKS), help=f"default: all of {', '.join(PILLAR_TASKS)}")
     p.add_argument("--no-tg", dest="tg", action="store_false", help="reactive policy")
     p.add_argument("--no-lidar", dest="lidar", action="store_false", help="blind policy")
@@ -1029,13 +989,13 @@ def parse(argv):
     p.add_argument("--world", choices=[*WORLDS, *PILLAR_TASKS], metavar="WORLD", default="maze",
                    help="a world or a training task (default %(default)s)")
     p.add_argument("--seed", type=natural, default=EVAL_SEED, help="layout (default %(default)s)")
-    p.add_argument("--gif", type=functools.partial(_file, ".gif"), metavar="FILE.gif",
+    p.add_argument("--gif", type=partial(_file, ".gif"), metavar="FILE.gif",
                    default="play.gif", help="(default %(default)s)")
     p.add_argument("--gui", action="store_true", help="PyBullet's window instead of a GIF")
     p.set_defaults(run=play)
 
     p = commands.add_parser("gallery", help="draw all terrains in one picture")
-    p.add_argument("--out", type=functools.partial(_file, ".png"), metavar="FILE.png",
+    p.add_argument("--out", type=partial(_file, ".png"), metavar="FILE.png",
                    default="gallery.png", help="(default %(default)s)")
     p.add_argument("--seed", type=natural, default=0)
     p.set_defaults(run=gallery)
@@ -1049,9 +1009,9 @@ def main(argv=None):
     argv = sys.argv[1:] if argv is None else argv
     args = parse(argv)
     try:
-        code = args.run(args)
+        code = args.run(args) or 0
         if not argv and not code and "RANK" not in os.environ:  # the main job: train, then score
-            code = eval_command(parse(["eval", str(Path(args.run_dir) / "policy.pt")]))
+            eval_command(parse(["eval", str(Path(args.run_dir) / "policy.pt")]))
         return code
     except (ValueError, OSError, ImportError, ArithmeticError, RuntimeError) as error:
         print(f"loco_mtrl.py: error: {error}", file=sys.stderr)
