@@ -118,9 +118,10 @@ def tables(results):
             if row in table:
                 t_cr = table[row]
                 cells = [f"{value:.2f}" for value in t_cr.mean(0)]
-                error = t_cr.mean(1).std(ddof=1) / len(t_cr) ** 0.5 if len(t_cr) > 1 else np.nan
-                lines.append(f"| {row} | {len(t_cr)} | {' | '.join(cells)} | "
-                             f"**{t_cr.mean():.3f}** ± {error:.3f} |")
+                mean = f"**{t_cr.mean():.3f}**"
+                if len(t_cr) > 1:
+                    mean += f" ± {t_cr.mean(1).std(ddof=1) / len(t_cr) ** 0.5:.3f}"
+                lines.append(f"| {row} | {len(t_cr)} | {' | '.join(cells)} | {mean} |")
             cells = [f"{value:.2f}" for value in paper(row)]
             lines.append(f"| *paper* | | {' | '.join(cells)} | {paper(row).mean():.3f} |")
         lines.append("")
@@ -142,11 +143,11 @@ def forgetting(results):
 
 
 def draw(results, path):
-    """Rows x worlds, ours and the paper's side by side."""
+    """Rows x worlds, ours and the paper's side by side; only rows that have been trained."""
     table = means(results)
     figure = Figure(figsize=(11, 4), layout="constrained")
-    ours = [table[row].mean(0) if row in table else np.full(8, np.nan) for row in ROWS]
-    theirs = [paper(row) for row in ROWS]
+    rows = [row for row in ROWS if row in table]
+    ours, theirs = [table[row].mean(0) for row in rows], [paper(row) for row in rows]
     for axis, values, title in zip(figure.subplots(1, 2, sharey=True), (ours, theirs),
                                    ("here", "in the paper"), strict=True):
         axis.imshow(values, vmin=0.2, vmax=0.9, cmap="viridis", aspect="auto")
@@ -154,7 +155,7 @@ def draw(results, path):
             axis.text(j, i, f"{value:.2f}", ha="center", va="center", fontsize=8,
                       color="k" if value > 0.6 else "w")
         axis.set_xticks(range(len(WORLDS)), WORLDS, rotation=30)
-        axis.set(yticks=range(len(ROWS)), yticklabels=list(ROWS), title=f"t_cr {title}")
+        axis.set(yticks=range(len(rows)), yticklabels=rows, title=f"t_cr {title}")
     figure.savefig(path, dpi=100)
 
 
