@@ -123,7 +123,7 @@ def tables(results):
                     mean += f" ± {t_cr.mean(1).std(ddof=1) / len(t_cr) ** 0.5:.3f}"
                 lines.append(f"| {row} | {len(t_cr)} | {' | '.join(cells)} | {mean} |")
             cells = [f"{value:.2f}" for value in paper(row)]
-            lines.append(f"| *paper* | | {' | '.join(cells)} | {paper(row).mean():.3f} |")
+            lines.append(f"| *{row}, paper* | | {' | '.join(cells)} | {paper(row).mean():.3f} |")
         lines.append("")
     return "\n".join(lines)
 
