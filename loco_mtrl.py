@@ -760,6 +760,11 @@ def open_scan(args):
     size = " x ".join(f"{side:.1f}" for side in high - low)
     print(f"{scan.name}: {size} m; its floor lies {abs(low[2]):.2f} m above the lowest point",
           file=sys.stderr)
+    a, b, c = (scan.vertices[scan.triangles[:, k]] for k in range(3))
+    facing = np.abs(np.cross(b - a, c - a)).sum(0)  # how much of it faces x, y, z
+    other, axis = ("y", 1) if args.up == "z" else ("z", 0)
+    if facing[axis] > facing[2]:  # floors and ceilings are more than walls, mostly
+        print(f"It may lie on its side: if so, --up {other}", file=sys.stderr)
     return scan
 
 

@@ -201,6 +201,19 @@ def scan(tmp_path):
     return ["--scan", str(tmp_path / "hall.obj"), "--scale", "0.01", "--up", "y"]
 
 
+@pytest.mark.parametrize(("upright", "up", "hint"), [
+    (True, "z", None), (False, "y", None), (False, "z", "--up y"), (True, "y", "--up z")])
+def test_a_scan_that_lies_on_its_side_gets_a_hint(upright, up, hint, tmp_path, capsys):
+    trimesh = pytest.importorskip("trimesh")
+    trimesh.creation.box((8, 6, 3) if upright else (8, 3, 6)).export(tmp_path / "hall.ply")
+    args = loco_mtrl.parse(["eval", "zero", "--scan", str(tmp_path / "hall.ply"), "--up", up])
+    place = loco_mtrl.open_scan(args)
+    first, *rest = capsys.readouterr().err.splitlines()
+    assert first.startswith("hall: " + " x ".join(f"{side:.1f}" for side in np.ptp(
+        place.vertices, 0)))
+    assert rest == ([f"It may lie on its side: if so, {hint}"] if hint else [])
+
+
 def test_eval_prints_the_same_table_twice_and_with_more_workers(trained, tmp_path, scan, capfd):
     """In a scanned building: its worlds are for `test_the_table_by_hand`, and for Ctrl-C."""
     policy, tables, reports = str(trained / "policy.pt"), [], []
