@@ -293,7 +293,7 @@ def test_a_script_without_a_main_guard_ends(tmp_path):
     assert done.returncode == 1 and "__main__" in done.stderr and "BrokenProcessPool" in done.stderr
 
 
-@pytest.mark.parametrize("closed", ["1", "2", "12"])
+@pytest.mark.parametrize("closed", ["1", "2", "012"])
 def test_it_can_be_imported_without_output(closed):
     close = "".join(f"exec {stream}>&-; " for stream in closed)
     done = subprocess.run(["bash", "-c", f"{close} {sys.executable} -c 'import loco_mtrl'"],
@@ -311,6 +311,7 @@ def test_play_writes_a_gif_that_moves(scan, tmp_path, capsys, monkeypatch):
     assert "hall: 6.0 x 8.0 x 3.0 m; its floor lies 0.00 m above the lowest point\n" in error
     assert said[0].startswith("hall: t_cr 0.") and said[0].endswith("ran out of time after 3.0 s")
     assert said[1:] == ["play.gif"]
+    assert {path.name for path in tmp_path.iterdir()} == {"play.gif", "hall.obj"}
     with Image.open("play.gif") as gif:
         assert gif.n_frames == 16 and gif.info["duration"] == 200  # 5 a second, as time goes by
         frames = []

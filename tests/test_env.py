@@ -440,6 +440,11 @@ def test_bad_arguments_are_named(options, named):
         LocoEnv(**options)
 
 
+def test_numpys_numbers_are_numbers_too():
+    with closing(LocoEnv("flat", (np.float32(0), np.int64(1)), layouts=np.int64(2))) as env:
+        assert len(env.pool) == 2
+
+
 def test_environments_are_not_copied(flat):
     for copies in (copy.deepcopy, pickle.dumps):
         with pytest.raises(TypeError, match="make another environment"):
