@@ -466,11 +466,15 @@ def iterate(model, optimiser, collector, config, progress, mirror):
 
 def write_whole(path, content):
     """Writes bytes; `path` is whole or as it was, even if the power fails or the disk is full."""
-    with open(f"{path}.tmp", "wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(f"{path}.tmp", path)
+    part = Path(f"{path}.tmp")
+    try:
+        with open(part, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(part, path)
+    finally:
+        part.unlink(missing_ok=True)  # or it would keep a full disk full
 
 
 def save(path, **content):

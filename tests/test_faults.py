@@ -168,6 +168,7 @@ def test_a_full_disk_leaves_the_last_checkpoint(room, tmp_path, unbroken):
     before = (tmp_path / "checkpoint.pt").read_bytes()
     assert in_a_child(full) == 0 and len(before) > 9000
     assert (tmp_path / "checkpoint.pt").read_bytes() == before
+    assert not list(tmp_path.glob("*.tmp"))
     assert same_bits(train(tmp_path, resume=True), unbroken)
 
 
