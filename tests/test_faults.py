@@ -303,7 +303,7 @@ def start(main, **environment):
     reader, writer = os.pipe()
 
     def child():
-        os.environ.update(environment, OMP_NUM_THREADS="1", PYTHONPATH=str(ROOT))
+        os.environ.update(environment, OMP_NUM_THREADS="1", PYTHONPATH=f"{ROOT}:{ROOT / 'tests'}")
         os.dup2(writer, 1), os.dup2(writer, 2), os.close(writer)
         sys.stdout = sys.stderr = open(2, "w", buffering=1, closefd=False)
         sys.exit(main())
@@ -418,38 +418,42 @@ def test_killed_ranks_are_all_named_and_the_program_as_it_was_called(
     assert all(line.endswith(f"checkpoint: {program} train --ranks 2 --resume") for line in lines)
 
 
+def rank_of_torchrun(folder, crashes):
+    """What a process that torchrun starts does here: trains, and writes down its states."""
+    again, rank = os.environ["TORCHELASTIC_RESTART_COUNT"] != "0", os.environ["RANK"]
+
+    def on_update(model, row):
+        if crashes and not again and row["update"] == 2:
+            die()
+
+    model = train(f"{folder}/run", total=3 * 2, changes={"num_envs": 4}, resume=again,
+                  on_update=on_update)
+    torch.save([model, again], f"{folder}/rank{rank}.pt")
+
+
 @pytest.fixture(scope="module")
-def ranks_of_torchrun(tmp_path_factory, unbroken):
-    """States of four ranks that torchrun's agents start: of two agents, and of one, with a crash.
+def ranks_of_torchrun(tmp_path_factory):
+    """States of two ranks that torchrun's agents start: of two agents, and of one, with a crash.
 
-    As `python -m torch.distributed.run` does, but forked, to spare the seconds that torch loads.
+    As `python -m torch.distributed.run` does, but for its agents, which are forked to save seconds.
+    Ranks must not be: a fork of an agent keeps what its threads have locked, now and then for ever.
     """
-    def main(folder, crashes):
-        again = os.environ["TORCHELASTIC_RESTART_COUNT"] != "0"
-
-        def on_update(model, row):
-            if crashes and not again and row["update"] == 2:
-                die()
-
-        model = train(folder / "run", total=3 * 2, changes={"num_envs": 4}, resume=again,
-                      on_update=on_update)
-        torch.save([model, again], folder / f"rank{os.environ['RANK']}.pt")
-
     def all_ranks(agents, crashes):
         folder = tmp_path_factory.mktemp("torchrun")
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             port = free.getsockname()[1]
         config = LaunchConfig(
-            min_nodes=agents, max_nodes=agents, nproc_per_node=4 // agents, max_restarts=crashes,
+            min_nodes=agents, max_nodes=agents, nproc_per_node=2 // agents, max_restarts=crashes,
             rdzv_backend="c10d", rdzv_endpoint=f"127.0.0.1:{port}", run_id="test",
-            start_method="fork", monitor_interval=0.1)
-        for process in [start(lambda: elastic_launch(config, main)(folder, crashes) and 0)
-                        for _ in range(agents)]:
+            monitor_interval=0.1)
+        command = f"import test_faults; test_faults.rank_of_torchrun({str(folder)!r}, {crashes})"
+        launch = elastic_launch(config, sys.executable)
+        for process in [start(lambda: launch("-c", command) and 0) for _ in range(agents)]:
             text = read(process)
             assert process[0].exitcode == 0, text
         assert [row["update"] for row in table(folder / "run")] == ["1", "2", "3"]
-        return [torch.load(folder / f"rank{rank}.pt") for rank in range(4)]
+        return [torch.load(folder / f"rank{rank}.pt") for rank in range(2)]
 
     return all_ranks(2, 0), all_ranks(1, 1)
 
